@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mi_ring.system import command, llvm
+from mi_ring.system import cache, command, llvm
 from mi_ring.version import __version__
 
 #: Packages that are not available for every machine, and what needs them.
@@ -65,7 +65,6 @@ def computing() -> Iterator[Finding]:
     import drjit as dr
     import torch
 
-    from mi_ring.system import cache
     from mi_ring.system.machine import cores, has_fast_bfloat16
 
     used = f"{cache.size() / 2**20:.0f} MiB, of at most {cache.LIMIT / 2**30:.0f} GiB, in {cache.cache_folder()}"
@@ -81,8 +80,6 @@ def computing() -> Iterator[Finding]:
 def main(arguments: Sequence[str]) -> int:
     """Run the command. Returns its exit status: 1 if a fit cannot run."""
     if command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False).empty_cache:
-        from mi_ring.system import cache  # which imports torch
-
         cache.empty()
     found = list(findings())
     for mark, what, text in found:

@@ -240,7 +240,9 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
             elif image.has_transparency_data:  # of palettes, too
                 pixels = np.array(image if image.mode == "LA" else image.convert("RGBA"))
             else:
-                pixels = np.array(image.convert("L" if image.mode in ("1", "L") else "RGB"))
+                if image.mode not in ("L", "RGB"):
+                    image = image.convert("L" if image.mode == "1" else "RGB")
+                pixels = np.asarray(image)  # without a copy: it may be large
     pixels = pixels if pixels.ndim == 3 else pixels[:, :, None]
     return as_stated(pixels, statement_of(path)) if heed else pixels
 

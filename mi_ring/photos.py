@@ -136,7 +136,7 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
                          f"valid/ and table.png beside it, to make it again from {config.out}/work")  # fmt: skip
     try:
-        with command.resumable(), locked(config.out, "DIR"), Steps(*STEPS):
+        with command.resumable(), locked(config.out, "DIR"), Steps(*(STEPS[-1:] if scene.exists() else STEPS)):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene, width=WIDTH))

@@ -3,8 +3,8 @@
 import os
 import subprocess
 import sys
-import textwrap
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +12,11 @@ import torch
 from PIL import Image
 
 import mi_ring
+from mi_ring.calibration.rig import Rig
 from mi_ring.capture import arrays, reduction
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import load_capture
+from mi_ring.capture.pixels import Pixels
 from mi_ring.geometry.camera import Camera
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.synthesis.viewpoints import look_at
@@ -140,14 +142,14 @@ def test_a_photograph_without_a_mask_is_not_cropped_and_one_that_its_object_fill
 def test_the_second_time_no_photograph_is_decoded(tmp_path, monkeypatch, own_cache):
     path = capture_of(tmp_path)
     first = load_capture(path, width=200)
-    files = sorted(own_cache.rglob("*.*") or own_cache.rglob("*"))
-    assert len([f for f in own_cache.rglob("*") if f.is_file()]) == 3 + 3, files  # photographs, bounds of masks
+    assert len(cache.files()) == 3 + 3  # photographs, bounds of masks
 
     def fail(*arguments):
         raise AssertionError("decoded again")
 
     with monkeypatch.context() as patch:
-        patch.setattr(reduction, "reduce", fail)
+        patch.setattr(reduction, "reduced_image", fail)
+        patch.setattr(reduction, "reduced_mask", fail)
         second = load_capture(path, width=200)
         for k in range(3):
             for a, b in zip(first.observe([k])[:4], second.observe([k])[:4]):
@@ -155,12 +157,56 @@ def test_the_second_time_no_photograph_is_decoded(tmp_path, monkeypatch, own_cac
     # Another photograph in the place of one is noticed, and so is a damaged file.
     pixels = photographs(seed=8)[0][1]
     Image.fromarray(pixels).save(tmp_path / "images/001.png")
-    for file in own_cache.rglob("*"):
-        if file.is_file() and file.stat().st_size > 100:
-            file.write_bytes(file.read_bytes()[:-30])
+    for _, _, file in cache.files():
+        file.write_bytes(file.read_bytes()[:-10])
     third = load_capture(path, width=200)
     assert (third.observe([0]).rgb == first.observe([0]).rgb).all()
     assert not (third.observe([1]).rgb == first.observe([1]).rgb).all()
+
+
+def test_what_is_in_the_cache_is_of_these_masks_alone(tmp_path):
+    """Not of those that a caller ignores or replaces."""
+    path = capture_of(tmp_path)
+    without = load_capture(path, masks="none", width=512, crop=False)
+    assert not any(without.masks.given)
+    given = load_capture(path, width=512, crop=False)
+    assert all(mask.any() for mask in given.masks)
+    whole = load_capture(path)
+    other = np.zeros((HEIGHT, WIDTH), np.uint8)
+    other[:80, :90] = 255
+    replaced = replace(whole, masks=Pixels.of([other] * 3))
+    corner = reduction.reduced(replaced, 512).shots[0].window.corner
+    assert corner == (0, 0) and load_capture(path, width=512).shots[0].window.corner != corner
+
+
+def test_other_files_in_the_folder_of_the_cache_are_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    (tmp_path / "go").mkdir()
+    for name in ("go/mine", "photographs.txt"):
+        (tmp_path / name).write_bytes(bytes(1000))
+    load_capture(capture_of(tmp_path), width=200)
+    (cache.cache_folder() / "notes.txt").write_text("mine")
+    cache.prune(10)
+    cache.empty()
+    assert cache.size() == 0 and (cache.cache_folder() / "notes.txt").exists()
+    assert (tmp_path / "go/mine").exists() and (tmp_path / "photographs.txt").exists()
+
+
+def test_the_lens_of_photographs_on_their_side_is_one(tmp_path):
+    """Their reduced focal lengths differ."""
+    images = [photographs()[0][0], np.ascontiguousarray(photographs()[0][1].transpose(1, 0, 2))]
+    cameras = [camera(0)._replace(focal=np.array([1400.0, 1400.0])),
+               camera(1, (HEIGHT, WIDTH))._replace(focal=np.array([1400.0, 1400.0]))]  # fmt: skip
+    capture = reduction.reduced(Capture.from_arrays(images, cameras=cameras), 300)
+    assert capture.shots[0].camera.focal[0] < 0.8 * capture.shots[1].camera.focal[0]
+    assert Rig(capture, np.zeros(3), 1.0).lens.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("size", [(6655, 4991), (4093, 4093), (1301, 977)])
+def test_the_squares_that_are_averaged_fill_the_window(size):
+    window = reduction.windowed(size, (0, 0), size, 512)
+    assert all(side % window.blocks == 0 for side in window.extent)
+    assert window.blocks <= window.scale.min() and window.size[0] <= 512
 
 
 def test_where_the_cache_cannot_be_written_photographs_are_read_each_time(tmp_path, monkeypatch):
@@ -172,12 +218,12 @@ def test_where_the_cache_cannot_be_written_photographs_are_read_each_time(tmp_pa
 
 def test_what_was_not_used_for_the_longest_time_leaves_the_cache_first():
     for k in range(5):
-        cache.store(f"{k}{k}key", bytes(1000))
-        os.utime(cache.place_of(f"{k}{k}key"), (k, k))
-    cache.cached("00key")
+        cache.store(f"{k:032x}", bytes(1000))
+        os.utime(cache.cache_folder() / f"{k:032x}", (k, k))
+    cache.cached(f"{0:032x}")
     cache.prune(4000)
-    left = {path.name for _, _, path in cache.files()}
-    assert left == {"00key", "33key", "44key"} and cache.size() == 3000
+    left = {int(path.name, 16) for _, _, path in cache.files()}
+    assert left == {0, 3, 4} and cache.size() == 3000
     cache.empty()
     assert cache.size() == 0
 
@@ -271,11 +317,11 @@ def test_memory_does_not_grow_with_photographs(tmp_path):
         cameras.append(shot._replace(focal=scale * shot.focal, centre=scale * shot.centre, size=size))
     shots, relative = [], []
     for k in range(24):
-        files = arrays.Files(*(tmp_path.__class__(f) for f in (f"images/{k % 3}.jpg", f"masks/{k % 3}.png")))
+        files = arrays.Files(Path(f"images/{k % 3}.jpg"), Path(f"masks/{k % 3}.png"))
         shots.append(Shot(f"{k:02}", cameras[k % 3], files=files, saturation=1 - 0.001 * k))  # none is read for another
         relative.append(files)
     (tmp_path / "scene.xml").write_bytes(arrays.scene_xml(shots, relative, None, None, None))
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(LARGE), tmp_path / "scene.xml"], capture_output=True,
+    done = subprocess.run([sys.executable, "-c", LARGE, tmp_path / "scene.xml"], capture_output=True,
                           text=True, env=os.environ | {cache.VARIABLE: str(tmp_path / "cache")})  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.split()[-1]) < 1.6

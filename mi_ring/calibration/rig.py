@@ -78,7 +78,8 @@ class Rig:
         self.flash = in_camera if rigid else None
         self.free = torch.tensor([1.0, 1.0, float(ahead or self.flash is None)])  #: components of the lights' offset
 
-        kinds = np.column_stack([views.intrinsics[:, :2].round(3), views.distortion.round(6)])
+        focal = np.stack([shot.whole.camera.focal for shot in capture.shots])
+        kinds = np.column_stack([focal.round(3), views.distortion.round(6)])
         lens = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
         relative = lights.positions() / np.where(lights.is_finite(), self.distance, 1.0)[:, None]
         place = np.unique(relative.round(6), axis=0, return_inverse=True)[1].ravel()

@@ -326,7 +326,7 @@ def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
     The centre is the point nearest to all optical axes, the radius half that of the ball there that all photographs
     contain.
     """
-    cameras = [shot.camera for shot in capture.shots]
+    cameras = [shot.whole.camera for shot in capture.shots]
     origins = np.stack([camera.position for camera in cameras])
     center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), str(capture.path))
     half_angle = min(np.arctan(min(camera.size) / 2 / camera.focal.max()) for camera in cameras)

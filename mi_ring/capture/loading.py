@@ -75,8 +75,10 @@ def load_capture(
         require_headers(shot, path, masks)
     if many:  # the first one shows at once what is wrong with all
         read_photograph(shots[0], path), given[0], valid[0]
-    if width and (small := reduced(capture, width, by_brightness, crop)) is not capture:
-        return small
+    if width:
+        capture, by_brightness = reduced(capture, width, by_brightness, crop), False
+        if any(shot.window for shot in capture.shots):
+            return capture
     if not many:
         for k in progress(range(len(shots)), "reading", unit="photograph", disable=None):
             pixels[k], given[k], valid[k]

@@ -2,12 +2,12 @@
 
 import hashlib
 import io
+import math
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,46 +16,39 @@ from numpy.typing import ArrayLike
 
 from mi_ring.capture.brightness_masks import bright, with_masks_by_brightness
 from mi_ring.capture.capture import Capture
-from mi_ring.capture.decoding import LinearImage, decode, is_linear
+from mi_ring.capture.decoding import LinearImage, decode, is_linear, read_mask, read_photograph
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.images import box_filter
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.system import cache
+from mi_ring.system.files import digest
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import progress
 
-FORMAT = "1"  #: of the cache's files; another one makes them anew
+FORMAT = "2"  #: change it if the content of cached files changes; files of another format are not used
 WIDTH = 512  #: to which photographs are reduced for check, and for fits that do not need more [px]
-HIGHEST = 1.5  #: largest height, in units of this width
+HIGHEST = 1.5  #: largest height of a reduced photograph, as a multiple of its largest width
 MARGIN = 0.06  #: around the object in a crop, as a share of its size
 WORTH_CROPPING = 0.8  #: a crop must be less wide or less high than this share of the photograph
 SMALL = 512  #: photographs up to this width are never cropped [px]
 COARSE = 512  #: width at which the object is searched in photographs without masks [px]
-ROWS = 256  #: of a photograph that are decoded at once: all of its pixels as floats would take too much memory
-DECODING = 2**30  #: bytes for photographs that are decoded at the same time
-PIXEL_BYTES = 8  #: that decoding a pixel takes
-MORE = np.array([[-1], [1]])  #: by how many pixels bounds are widened that were found in a small picture
-
-
-class Reduced(NamedTuple):
-    """A photograph cropped and reduced to a window, with its masks; None where it has no such file."""
-
-    image: LinearImage
-    mask: np.ndarray | None  #: (H, W) uint8, the object's coverage
-    valid: np.ndarray | None  #: (H, W) uint8, 255 where all pixels of the photograph are valid, else 0
+ROWS = 256  #: rows of a photograph that are decoded at once: all pixels as floats would take too much memory
+DECODING = 2**30  #: memory for photographs that are decoded at the same time [bytes]
+JPEG_BYTES, PIXEL_BYTES = 8, 40  #: of it for a pixel of a JPEG file, and of any other photograph
+MORE = np.array([[-1], [1]])  #: bounds found in a reduced mask are widened by one of its pixels
 
 
 def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, crop: bool = True) -> Capture:
     """Reduce the photographs of a capture to at most this `width` [px], and crop them to the object where that helps.
 
     `by_brightness`: masks are found by brightness, as `with_masks_by_brightness` does. Without `crop` photographs are
-    only made smaller. Returns the capture itself if no photograph changes, or if it was reduced before. Raises
-    InputError like `load_capture`.
+    only made smaller. Photographs that are small stay as they are. So do those of a capture that was reduced before,
+    whatever its width is. Raises InputError like `load_capture`.
     """
-    small = all(shot.size[0] <= SMALL and fitting(shot.size, width) == 1 for shot in capture.shots)
+    small = all(shot.size[0] <= SMALL and reduction_factor(shot.size, width) == 1 for shot in capture.shots)
     if any(shot.window for shot in capture.shots) or not capture.images or small:
         return with_masks_by_brightness(capture) if by_brightness else capture
-    large = any(fitting(shot.size, width) > 1 for shot in capture.shots)
+    large = any(reduction_factor(shot.size, width) > 1 for shot in capture.shots)
     searched = capture
     if by_brightness:
         if large:
@@ -74,14 +67,14 @@ def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, c
     return result
 
 
-def fitting(size: tuple[int, ...], width: int) -> float:
-    """The factor, at least 1, by which a picture (width, height) [px] must be reduced to be at most `width` wide."""
+def reduction_factor(size: tuple[int, ...], width: int) -> float:
+    """By which factor an image (width, height) [px] must be reduced to be at most `width` [px] wide; at least 1."""
     return max(1.0, size[0] / width, size[1] / (HIGHEST * width))
 
 
 def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], width: int) -> Window:
-    """Make a window of a photograph of size `whole` [px]: corner `low`, size `extent`, reduced to `width` or less."""
-    scale = fitting(tuple(extent), width)
+    """Make the window of a photograph of size `whole` from `low` on, reduced to at most this `width` [px]."""
+    scale = reduction_factor(tuple(extent), width)
     blocks = int(scale)  # the first step of the reduction averages squares of so many pixels
     extent = [blocks * (side // blocks) for side in extent]
     width, height = (max(1, round(side / scale)) for side in extent)
@@ -110,20 +103,19 @@ def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], wid
 
 
 def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
-    """The lowest and the highest corner (2, 2) [px] of each mask; None if there is no mask or it is empty.
+    """Find the lowest and the highest corner (2, 2) [px] of each mask; None without one, or if it is empty.
 
-    Results of `large` masks are kept in the cache folder.
+    Those of `large` masks are kept in the cache folder.
     """
+    several = {reader: k for k, reader in enumerate(capture.masks.readers) if reader}  # some may share a mask
 
-    def bounds(k: int) -> np.ndarray | None:
-        shot = capture.shots[k]
-        key = None
-        if large and not shot.window and shot.files.mask:
-            key = key_of("bounds", digest(shot.files.mask), shot.files.mask == shot.files.filename)
-            if path := cache.cached(key):
-                return unless_empty(np.frombuffer(path.read_bytes(), np.int32).reshape(2, 2))
-        mask = capture.masks[k] > 127
-        columns, rows = np.flatnonzero(mask.any(0)), np.flatnonzero(mask.any(1))
+    def bounds(k: int) -> np.ndarray:
+        shot, read = capture.shots[k], capture.masks.readers[k]
+        key = key_of("bounds", source(read)) if large and source(read) else None
+        if (path := key and cache.cached(key)) and len(content := path.read_bytes()) == 16:
+            return np.frombuffer(content, np.int32).reshape(2, 2)
+        inside = read() > 127  # not kept: it may be large
+        columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
         found = np.zeros((2, 2), np.int32)
         if len(rows):
             found[:] = (columns[0], rows[0]), (columns[-1] + 1, rows[-1] + 1)
@@ -131,106 +123,106 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
                 found = np.clip((found + MORE) * shot.window.scale, 0, shot.window.whole).astype(np.int32)
         if key:
             cache.store(key, found.tobytes())
-        return unless_empty(found)
+        return found
 
-    def unless_empty(found: np.ndarray) -> np.ndarray | None:
-        return found if found.any() else None
-
-    given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
-    result: list[np.ndarray | None] = [None] * len(capture)
-    threads = concurrent(max(shot.size for shot in capture.shots))
-    for k, found in zip(given, progress(in_threads(bounds, given, most=threads), "reading masks", total=len(given),
-                                        unit="mask", disable=None)):  # fmt: skip
-        result[k] = found
-    return result
+    found = dict(zip(several, in_turn(bounds, capture, list(several.values()), "reading masks")))
+    return [found[reader] if reader and found[reader].any() else None for reader in capture.masks.readers]
 
 
 def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
-    """Cut a capture down to one window of each photograph, all read at once. `doing`: name of the progress bar."""
-    shots = [shot.through(window) for shot, window in zip(capture.shots, windows)]
-    of_files = not capture.in_memory
+    """Look at a capture through these windows of its photographs. Photographs in files are read at once."""
+    shots = tuple(shot.through(window) for shot, window in zip(capture.shots, windows))
 
-    def made(k: int) -> Callable[[], Reduced]:
-        """Make a reader of photograph `k` through its window, and keep the result in the cache folder if possible."""
-        make = partial(reduce, capture, k, windows[k])
-        if not of_files:
+    def parts(k: int) -> dict[str, Callable[[], Any]]:
+        """Readers of photograph `k` and its masks, which are in the cache folder now, if that can be written."""
+        shot, window = capture.shots[k], windows[k]
+        sources = {name: getattr(capture, name).readers[k] for name in ("images", "masks", "valid")}
+        make: dict[str, Callable[[], Any]] = {"images": partial(reduced_image, shot, sources["images"], window)}
+        if sources["masks"]:
+            make["masks"] = partial(reduced_mask, sources["masks"], window)
+        if sources["valid"]:
+            make["valid"] = partial(reduced_valid, sources["valid"], window)
+        files = [source(sources[name]) for name in make]
+        if not all(files):  # arrays of the user
             return make
-        key = key_of("photograph", *map(digest, capture.shots[k].files), *decoded_by(capture.shots[k]), windows[k])
-        if cache.cached(key) or cache.store(key, packed(make())):
-            return partial(unpacked, key, make)
-        return make
+        key = key_of("photograph", *make, files, shot.encoding, shot.saturation, shot.response.gamma,
+                     shot.response.contrast, window)  # fmt: skip
+        stored: dict[str, Callable[[], Any]]
+        stored = {name: partial(unpacked, key, name, made) for name, made in make.items()}
+        if cache.cached(key):
+            return stored
+        arrays = {name: made() for name, made in make.items()}
+        if cache.store(key, packed(arrays)):
+            return stored
+        return {name: partial(arrays.get, name) for name in arrays}
 
-    several = range(len(shots))
-    threads = concurrent(max(shot.size for shot in capture.shots))
-    readers = list(progress(in_threads(made, several, most=threads), doing, total=len(shots), unit="photograph",
-                            disable=None))  # fmt: skip
+    readers = in_turn(parts, capture, range(len(shots)), doing)
     cache.prune()
     shared: dict[tuple, Reader] = {}
 
-    def part(field: str, k: int, given: bool) -> Reader | None:
-        reader = partial(member, readers[k], field)
-        # Photographs that share a mask and a window share its array.
-        several = capture.masks if field == "mask" else capture.valid
-        key = field, several.readers[k], windows[k]
-        return shared.setdefault(key, reader) if given else None
+    def pixels(name: str) -> Pixels:
+        """One reader for photographs that share a file and a window."""
+        before = getattr(capture, name).readers
+        return Pixels(own.get(name) and shared.setdefault((name, before[k], windows[k]), own[name])
+                      for k, own in enumerate(readers))  # fmt: skip
 
-    images = Pixels(partial(member, reader, "image") for reader in readers)
-    masks = Pixels(part("mask", k, given) for k, given in enumerate(capture.masks.given))
-    valid = Pixels(part("valid", k, given) for k, given in enumerate(capture.valid.given))
-    return replace(capture, shots=tuple(shots), images=images, masks=masks, valid=valid)
+    return replace(capture, shots=shots, images=pixels("images"), masks=pixels("masks"), valid=pixels("valid"))
 
 
-def member(read: Callable[[], Reduced], field: str) -> Any:
-    """Read one field of a reduced photograph."""
-    return getattr(read(), field)
+def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[int], doing: str) -> list[Any]:
+    """Call a function that decodes a photograph for each of these, in as many threads as memory allows."""
+
+    def memory(shot: Shot) -> int:
+        file = shot.files.filename
+        small = file is not None and file.suffix.lower() in (".jpg", ".jpeg") and not shot.files.ambient
+        return math.prod(shot.size) * (JPEG_BYTES if small else PIXEL_BYTES)
+
+    most = max(1, DECODING // max(map(memory, capture.shots)))
+    results = in_threads(function, index, most=most)
+    return list(progress(results, doing, total=len(index), unit="photograph", disable=None))
 
 
-def concurrent(size: tuple[int, int]) -> int:
-    """How many photographs of this size [px] may be decoded at the same time."""
-    return max(1, DECODING // (PIXEL_BYTES * size[0] * size[1]))
-
-
-def reduce(capture: Capture, k: int, window: Window) -> Reduced:
-    """Read photograph `k` of a capture, and crop and reduce it to a window."""
-    shot = capture.shots[k]
-    read = capture.images.readers[k]
-    assert read is not None
-    image = read()  # not kept: it is large
+def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
+    """Decode a photograph and reduce it to a window, by strips: float16 for 8 bits, else float32."""
+    image = read()
     radiance, clipped = [], []
-    blocks, rows = int(window.scale.min()), max(1, ROWS // int(window.scale.min()))
-    (left, top), (width, height) = window.corner, window.extent
-    for first in range(0, height, rows * blocks):
-        part = image[top + first : top + min(first + rows * blocks, height), left : left + width]
+    blocks, (left, top), (width, height) = window.blocks, window.corner, window.extent
+    rows = blocks * max(1, ROWS // blocks)
+    for first in range(top, top + height, rows):
+        part = image[first : min(first + rows, top + height), left : left + width]
         linear, over = decode(part, is_linear(shot.encoding, part), shot.saturation, shot.response.gamma,
                               shot.response.contrast)  # fmt: skip
         radiance.append(averaged(linear, blocks))
         clipped.append(averaged(over, blocks) > 0 if over.any() else np.zeros(radiance[-1].shape, bool))
-    kind = np.float16 if image.dtype == np.uint8 else np.float32
-    rgb = resized(np.concatenate(radiance), window).astype(kind)
     over = resized(np.concatenate(clipped).astype(np.float32), window) > 0
-    del image
-    mask, valid = capture.masks.readers[k], capture.valid.readers[k]
-    return Reduced(
-        LinearImage(rgb, over),
-        None if mask is None else covered(mask(), window).round().astype(np.uint8),
-        None if valid is None else np.where(covered(255 * (valid() > 127), window) > 254.9, np.uint8(255), np.uint8(0)),
-    )
+    return LinearImage(resized(np.concatenate(radiance), window).astype(
+        np.float16 if image.dtype == np.uint8 else np.float32), over)  # fmt: skip
 
 
-def covered(mask: np.ndarray, window: Window) -> np.ndarray:
-    """Reduce a mask (H, W) to a window: the mean of the mask over each pixel of the window."""
+def reduced_mask(read: Reader, window: Window) -> np.ndarray:
+    """Reduce a mask to a window: (H, W) uint8, the object's coverage."""
+    return means(read(), window).round().astype(np.uint8)
+
+
+def reduced_valid(read: Reader, window: Window) -> np.ndarray:
+    """Reduce a mask of valid pixels to a window: (H, W) uint8, 255 where all pixels of the photograph are valid."""
+    return np.where(means(read() > 127, window) > 1 - 1e-5, np.uint8(255), np.uint8(0))
+
+
+def means(mask: np.ndarray, window: Window) -> np.ndarray:
+    """Average a mask (H, W) to a window."""
     (left, top), (width, height) = window.corner, window.extent
     part = mask[top : top + height, left : left + width, None]
-    return resized(averaged(part, int(window.scale.min())), window)[..., 0]
+    return resized(averaged(part, window.blocks), window)[..., 0]
 
 
 def averaged(pixels: np.ndarray, blocks: int) -> np.ndarray:
-    """Reduce pixels to the means of squares of `blocks` × `blocks` pixels, float32."""
+    """Average squares of so many pixels (H, W, C); float32."""
     return box_filter(torch.from_numpy(np.ascontiguousarray(pixels, np.float32)), blocks).numpy()
 
 
 def resized(pixels: np.ndarray, window: Window) -> np.ndarray:
-    """Resize pixels (H, W, C) to the size of a window, by the means of areas."""
+    """Average areas of an image (H, W, C), so that it has the size of a window."""
     if pixels.shape[1::-1] == window.size:
         return pixels
     return cv2.resize(pixels, window.size, interpolation=cv2.INTER_AREA).reshape(*window.size[::-1], -1)
@@ -246,47 +238,40 @@ def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
     return result
 
 
-def decoded_by(shot: Shot) -> tuple:
-    """The settings by which a photograph's pixels are decoded, for the key of the cache."""
-    return shot.encoding, shot.saturation, shot.response.gamma, shot.response.contrast, *same_files(shot)
-
-
-def same_files(shot: Shot) -> tuple[bool, bool]:
-    """Does a photograph's alpha channel hold its mask; does it hold the map of valid pixels?"""
-    return shot.files.mask == shot.files.filename, shot.files.valid == shot.files.filename
-
-
-def digest(file: Path | None) -> str:
-    """A hash of the content of a file; empty if there is no file."""
-    if file is None:
-        return ""
-    result = hashlib.blake2b(digest_size=16)
-    with file.open("rb") as opened:
-        while part := opened.read(2**22):
-            result.update(part)
-    return result.hexdigest()
+def source(read: Reader | None) -> tuple | None:
+    """What a reader of `mi_ring.capture.decoding` reads: its name, field, and digests of files. None for any other."""
+    if not isinstance(read, partial) or read.func not in (read_photograph, read_mask):
+        return None
+    shot, *field = read.args[:-1]
+    files = [getattr(shot.files, name) for name in field] or [shot.files.filename, shot.files.ambient]
+    return read.func.__name__, *(file and digest(file) for file in files), files[0] == shot.files.filename
 
 
 def key_of(*parts: Any) -> str:
-    """The key in the cache for a result that is made of these parts."""
+    """Make the cache's key of what is made of these parts."""
     return hashlib.blake2b(repr((FORMAT, *parts)).encode(), digest_size=16).hexdigest()
 
 
-def packed(photograph: Reduced) -> memoryview:
-    """Convert a reduced photograph to the content of its file in the cache."""
-    image, mask, valid = photograph
-    arrays: dict[str, Any] = {"rgb": image.rgb, "clipped": np.packbits(image.clipped), "mask": mask, "valid": valid}
+def packed(arrays: dict[str, Any]) -> memoryview:
+    """Make the cache's file of a reduced photograph and its masks."""
+    image = arrays["images"]
+    content = arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped)}
     buffer = io.BytesIO()
-    np.savez(buffer, **{name: array for name, array in arrays.items() if array is not None})
+    np.savez(buffer, **content)
     return buffer.getbuffer()
 
 
-def unpacked(key: str, make: Callable[[], Reduced]) -> Reduced:
-    """Read the reduced photograph with this key from the cache, or `make` it if its file is gone or damaged."""
+def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | LinearImage:
+    """Read a reduced photograph or mask from the cache's file with this key; if that is gone or damaged, `make` it."""
+    path = cache.cached(key)
     try:
-        with np.load(cache.place_of(key)) as file:
-            rgb = file["rgb"]
-            clipped = np.unpackbits(file["clipped"], count=rgb.size).reshape(rgb.shape).astype(bool)
-            return Reduced(LinearImage(rgb, clipped), *(file.get(name) for name in ("mask", "valid")))
+        with np.load(path or "") as file:
+            array = file[name]
+            if name != "images":
+                return array
+            clipped = np.unpackbits(file["clipped"], count=array.size).reshape(array.shape)
+            return LinearImage(array, clipped.astype(bool))
     except (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile):
+        if path:
+            path.unlink(missing_ok=True)  # so that it is made anew the next time
         return make()

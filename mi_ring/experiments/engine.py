@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.capture.reduction import WIDTH
 from mi_ring.collection.fits import fit_to_the_end
 from mi_ring.collection.jobs import Job, Record, modified
 from mi_ring.errors import InputError
@@ -113,7 +114,7 @@ def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptio
 
     with threads_of(options.threads):
         config = run.config(options)
-        capture = load_capture(run.dataset.scene, masks=config.masks)
+        capture = load_capture(run.dataset.scene, masks=config.masks, width=max(WIDTH, *config.widths))
         fit = Fit(capture, config, callbacks=[measure], lighting=choose_lighting(capture, config))
         for _ in progress(fit, "iterations", total=fit.iterations):
             pass

@@ -1,7 +1,6 @@
 """Checkpoints: what `--resume` needs, and whether the files of the fit are still the same."""
 
 import contextlib
-import hashlib
 import math
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.config import WEIGHTS, Config, as_typed
 from mi_ring.fitting.fit import Fit
 from mi_ring.objects.ring_file import read_state
-from mi_ring.system.files import is_sealed, relative_to, write_state
+from mi_ring.system.files import digest, is_sealed, relative_to, write_state
 from mi_ring.version import __version__
 
 NAME = "checkpoint.pt"
@@ -108,12 +107,3 @@ def digests(capture: Capture, config: Config) -> dict[str, str]:
     if isinstance(config.domain, tuple):
         files.add(Path(config.domain[1]))
     return {relative_to(capture.path.parent, file): digest(file) for file in files if file}
-
-
-def digest(file: Path) -> str:
-    """A hash of a file's content."""
-    result = hashlib.blake2b(digest_size=16)
-    with file.open("rb") as stream:
-        while block := stream.read(2**20):
-            result.update(block)
-    return result.hexdigest()

@@ -120,7 +120,8 @@ class Hull:
             if valid is not None:
                 row, column = (place * size).nan_to_num(-1).long().flip(1).T
                 row, column = row.clamp(0, mask.shape[0] - 1), column.clamp(0, mask.shape[1] - 1)
-                seen &= torch.from_numpy(valid > 127)[row, column]
+                beyond = ((place - 0.5).abs() > 0.5).any(1)  # of a part of the photograph; nothing is there
+                seen &= beyond | torch.from_numpy(valid > 127)[row, column]
             where, padding = 2 * place[None, None] - 1, "zeros" if frame is None else "border"
             sampled = F.grid_sample(distance[None, None], where, padding_mode=padding, align_corners=False)
             inside = sampled[0, 0, 0]

@@ -25,7 +25,8 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
 
     agree, why = shares(capture.hull), None
     if capture.whole and agree.min() < CONFORMS:
-        why = mistake([silhouette.whole for silhouette in silhouettes]) if np.median(agree) < CONFORMS else None
+        whole = [silhouette.whole for silhouette in subsample(silhouettes, 32, 96)]
+        why = mistake(whole) if np.median(agree) < CONFORMS else None
         if not why:  # one wrong mask damages the hull; a hull that tolerates wrong masks may find it
             tolerant = copy.copy(capture.hull)
             tolerant.outliers = max(0.1, 1.01 / len(tolerant.silhouettes))

@@ -52,7 +52,8 @@ class PhotographPanel:
     psnr: float
     iou: float | None
     saturated: float  # share of the object's pixels
-    shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px]
+    shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px of its file]
+    pixel: float  # of the compared photograph [px of its file]
     pictures: dict[str, str]
     held_out: bool = False  # then the page has no findings about it
 
@@ -145,12 +146,13 @@ def fit_findings(
     if shifts:
         shift, scatter = middle([by for _, by in shifts])
         scatter = np.hypot(*scatter)
-        if np.hypot(*shift) > max(ALL_SHIFTED, 3 * scatter / math.sqrt(len(shifts))):
+        pixel = float(np.median([row.pixel for row in rows]))
+        if np.hypot(*shift) > max(ALL_SHIFTED * pixel, 3 * scatter / math.sqrt(len(shifts))):
             found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cameras (cx and cy "
                          "or to_world) or masks seem off by this shift or more. Measured cameras need the first "
                          "pixel's centre at (0.5, 0.5); correct others with --refine auto cameras.")  # fmt: skip
         away = [(name, np.subtract(by, shift)) for name, by in shifts]
-        limit = max(SHIFTED, 3 * scatter)
+        limit = max(SHIFTED * pixel, 3 * scatter)
         if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):
             found.append(f"{few} of the prediction, unlike the others; correct the pose, or leave the "
                          "photograph out.")  # fmt: skip
@@ -242,12 +244,14 @@ def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tupl
             pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
     error = float(np.mean((photo - guess)[compared] ** 2))
     by = shift(photo * inside[..., None] if masked else photo, guess, inside | found)
+    along, down = shot.window.scale if shot.window else (1.0, 1.0)
     row = PhotographPanel(
         name=capture.names[k],
         psnr=-10 * np.log10(max(error, 1e-10)),
         iou=float((inside & found).sum() / max(1, (inside | found).sum())) if masked and capture.whole else None,
         saturated=float(saturated[inside].any(-1).mean()) if inside.any() else 0.0,
-        shift=by and (scale * by[0], scale * by[1]),
+        shift=by and (scale * along * by[0], scale * down * by[1]),
+        pixel=float(along),
         held_out=k in result.held_out,
         pictures={title: data_uri(picture) for title, picture in pictures.items()},
     )

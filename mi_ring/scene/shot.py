@@ -40,6 +40,14 @@ class Window(NamedTuple):
         return np.divide(self.extent, self.size)
 
     @property
+    def blocks(self) -> int:
+        """Side of the squares of pixels that the first step of the reduction averages [px]."""
+        blocks = int(self.scale.min())
+        while any(side % blocks for side in self.extent):
+            blocks -= 1
+        return blocks
+
+    @property
     def share(self) -> float:
         """Share of the photograph's area in the window."""
         return float(np.prod(self.extent) / np.prod(self.whole))

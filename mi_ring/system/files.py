@@ -107,6 +107,15 @@ def fingerprint(content: bytes | memoryview) -> bytes:
     return hashlib.blake2b(content, digest_size=DIGEST // 2).hexdigest().encode()
 
 
+def digest(file: Path) -> str:
+    """A hash of a file's content."""
+    result = hashlib.blake2b(digest_size=16)
+    with file.open("rb") as stream:
+        while block := stream.read(2**20):
+            result.update(block)
+    return result.hexdigest()
+
+
 def read_json(path: Path) -> Any:
     """The content of a JSON file that we wrote; None if it does not exist or is damaged."""
     try:
