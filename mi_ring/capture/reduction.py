@@ -111,6 +111,7 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
 
     def bounds(k: int) -> np.ndarray:
         shot, read = capture.shots[k], capture.masks.readers[k]
+        assert read is not None
         key = key_of("bounds", source(read)) if large and source(read) else None
         if (path := key and cache.cached(key)) and len(content := path.read_bytes()) == 16:
             return np.frombuffer(content, np.int32).reshape(2, 2)
