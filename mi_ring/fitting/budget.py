@@ -24,7 +24,7 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
 
     Another fit runs them, from the state of this one. Returns an empty dictionary if `interrupted`.
     """
-    print("Measuring what iterations take on this machine", flush=True)
+    print("Measuring how long iterations take, to say how long is left", flush=True)
     trial = Fit(fit.problem.given, fit.problem.config, terms=fit.loss.terms, state=fit.state())
     trial.ring.domain = fit.ring.domain  # it caches its samplings for the fit, too
     state, costs = trial.sampler.state(), {}
