@@ -151,7 +151,7 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
     descriptors = read_descriptors(folder / "database.db")
     files = [grey_file(picture) for picture in pictures]
     pairs = [(files[a], files[b]) for a, b in pairs_to_match([descriptors[file] for file in files])]
-    for number, _ in enumerate(progress(match_pairs(pairs, descriptors, folder), "pairs", len(pairs)), 1):
+    for number, _ in enumerate(progress(match_pairs(pairs, descriptors, folder), "matching", len(pairs)), 1):
         if number == min(BATCH, len(pairs)):
             share = static_share(folder / "database.db", pairs[:number])
             if share >= MAX_STATIC:
