@@ -336,7 +336,7 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
     stream = mi.MemoryStream()
     with exr_threads() if kind == formats.OpenEXR else contextlib.nullcontext():
-        mi.Bitmap(np.ascontiguousarray(pixels)).write(stream, kind)
+        mi.Bitmap(np.require(pixels, requirements="CW")).write(stream, kind)
     write_file(path, stream.raw_buffer())
 
 

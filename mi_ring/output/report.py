@@ -53,9 +53,9 @@ class PhotographPanel:
     iou: float | None
     saturated: float  # share of the object's pixels
     shift: tuple[float, float] | None  # how far the photograph is right of and below its prediction [px of its file]
-    pixel: float  # of the compared photograph [px of its file]
     pictures: dict[str, str]
     held_out: bool = False  # then the page has no findings about it
+    pixel: float = 1.0  # side of a pixel of the compared photograph [px of its file]
 
 
 def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
