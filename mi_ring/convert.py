@@ -6,7 +6,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from mi_ring.errors import InputError
-from mi_ring.importers.conversion import write_scene
+from mi_ring.importers.conversion import report, write_scene
 from mi_ring.importers.formats import FORMATS
 from mi_ring.system import command
 
@@ -24,13 +24,7 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"FORMAT: is {arguments[0]}; must be one of {', '.join(FORMATS)}")
     source = command.parse(Formats, arguments, "mi_ring.convert", description=DESCRIPTION)
     frames = write_scene(source)
-    if source.without_pose:
-        some = sorted(source.without_pose)
-        print(f"{len(some)} of {len(some) + len(frames)} photographs left out, without a pose: {', '.join(some[:3])}"
-              f"{', …' if len(some) > 3 else ''}")  # fmt: skip
-    masked = sum(frame.mask is not None for frame in frames)
-    print(f"{len(frames)} photographs, {masked} with masks, of {len({f.pose.tobytes() for f in frames})} cameras: "
-          f"{source.scene}\nNow: python -m mi_ring.fit {source.scene}")  # fmt: skip
+    print(f"{report(source, frames)}\nNow: python -m mi_ring.fit {source.scene}")
 
 
 if __name__ == "__main__":

@@ -290,6 +290,7 @@ def test_what_strangers_files_do_to_their_readers_is_one_line(colmap, tmp_path, 
 
 
 def test_colmap_without_masks_and_exif(colmap, tmp_path):
+    (colmap / "masks").rename(tmp_path / "aside")
     scene = converted("colmap", colmap, tmp_path / "scan.xml", "--no-exif")
     assert list(scene.masks) == [None] * 3
     lights = scene.photographs.lights
@@ -381,7 +382,7 @@ def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, cap
 @pytest.mark.parametrize(("edit", "pattern"), [
     (lambda d: d.update(frames=[]), "frames: found none"),
     (lambda d: d["frames"][1].pop("file_path"), r"frames\[1\].file_path: missing"),
-    (lambda d: d["frames"][1].update(file_path="gone"), r"frames\[1\].file_path: no such file"),
+    (lambda d: [f.update(file_path="gone") for f in d["frames"][1:]], "SRC: 2 of 3 cameras have no photograph"),
     (lambda d: d["frames"][2].pop("transform_matrix"), r"frames\[2\].transform_matrix: is missing; must be 4 x 4"),
     (lambda d: d["frames"][0]["transform_matrix"][1].pop(), r"frames\[0\].transform_matrix"),
     (lambda d: d["frames"][0]["transform_matrix"].__setitem__(1, [float("nan")] * 4), "NaN"),
@@ -459,8 +460,7 @@ def test_wrong_counts_of_photographs_and_masks(tmp_path):
     (lambda d: d["1.png"].update(img_size=[9, 9]), "1.exr: photograph: is 62 x 52 pixels, but its camera 9 x 9"),
     (lambda d: d["1.png"].update(img_size="large"), "1.png.img_size"),
     (lambda d: d["1.png"].update(K=[0] * 16), "1.png.K"),
-    (lambda d: d.update({"7.png": d["1.png"]}), "7.png: no such file"),
-    (lambda d: d.update({"/": d["1.png"]}), "/: no such file: /"),
+    (lambda d: d.update({"7.png": d.pop("1.png"), "8.png": d.pop("2.png")}), "2 of 3 cameras have no photograph in"),
     (lambda d: d.update({"1.png": 3}), "must be an object"),
     (lambda d: d.clear(), "no photographs"),
 ])  # fmt: skip
@@ -472,7 +472,7 @@ def test_exif_that_is_no_number(colmap, tmp_path):
     exif = Image.Exif()
     exif.get_ifd(0x8769).update({33434: IFDRational(0, 0), 33437: 2.8, 34855: 100})
     Image.fromarray(noise(np.uint8)).save(colmap / "images/sub/2.jpg", exif=exif)
-    refused(["colmap", colmap], r"\.jpg: EXIF: exposure time, ISO and aperture are nan", tmp_path / "out/scene.xml")
+    refused(["colmap", colmap], r"\.jpg: EXIF: .*; other photographs have more", tmp_path / "out/scene.xml")
 
 
 def test_an_empty_list_of_lights(diligent, tmp_path):

@@ -1,6 +1,5 @@
 """From photographs to a capture, piece by piece: pictures, masks, the table, crops."""
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +28,6 @@ from mi_ring.photogrammetry.capture_files import (
 )
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.marker_sheet import SheetDetection
-from mi_ring.photogrammetry.matching import pairs_to_match
 from mi_ring.photogrammetry.object_masks import SegmentationInput, locate_object
 from mi_ring.photogrammetry.reduced_photographs import (
     paste_mask,
@@ -353,13 +351,6 @@ def test_of_two_ways_of_putting_photographs_together_the_one_that_explains_more_
     monkeypatch.setattr(structure_from_motion, "map_globally", lambda *_: {})
     monkeypatch.setattr(structure_from_motion, "map_incrementally", lambda *_: {})
     assert structure_from_motion.reconstruct(tmp_path, 3, None) is None
-
-
-def test_pairs_of_few_photographs_are_all_and_of_many_are_near_ones_and_some():
-    assert pairs_to_match(5) == list(itertools.combinations(range(5), 2))
-    pairs = set(pairs_to_match(1000))
-    assert {(k, k + 1) for k in range(999)} <= pairs and len(pairs) < 15000
-    assert (0, 500) in pairs or (0, 975) in pairs  # the way round is closed
 
 
 def test_a_motion_in_another_frame_shows_points_at_the_same_pixels():

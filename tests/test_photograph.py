@@ -119,8 +119,10 @@ def test_a_step_along_an_edge_is_photographed_by_a_lens_as_finite_differences_sa
     point, tangent = np.array([0.4, 0.1, -0.2]), np.array([0.3, -0.5, 0.2])
     ours = Camera(POSE, np.array([FX, FY]), np.array([CX, CY]), (WIDTH, HEIGHT), -0.2)
     high, low = (ours.project((point + t * tangent)[None])[0][0] for t in (1e-5, -1e-5))
-    found = camera()._replace(distortion=mi.Float(-0.2)).project_tangent(
-        mi.Point3f(point.tolist()), mi.Vector3f(tangent.tolist())
+    found = (
+        camera()
+        ._replace(distortion=mi.Float(-0.2))
+        .project_tangent(mi.Point3f(point.tolist()), mi.Vector3f(tangent.tolist()))
     )
     np.testing.assert_allclose(np.array(found).ravel(), (high - low) / 2e-5, rtol=1e-4)
 

@@ -123,7 +123,7 @@ def test_pixels_that_are_not_valid_stay_so(tmp_path):
     made = Capture.from_arrays(images, masks, cameras=[camera(k) for k in range(3)], valid=[valid, None, None])
     capture = load_capture(made.save(tmp_path / "scene.xml").path, width=200)
     shot, seen = capture.shots[0], capture.observe([0])
-    inside = ((np.arange(seen.valid.shape[2] + 1) * shot.window.scale[0]) + shot.window.corner[0])
+    inside = (np.arange(seen.valid.shape[2] + 1) * shot.window.scale[0]) + shot.window.corner[0]
     touched = (inside[1:] > 500) & (inside[:-1] < 503)
     np.testing.assert_array_equal(seen.valid[0].numpy(), np.broadcast_to(~touched, seen.valid.shape[1:]))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading
-from mi_ring.images import contrasted, image_size, linear_to_srgb, read_image, srgb_to_linear
+from mi_ring.images import contrasted, image_size, linear_to_srgb, mask_values, read_image, srgb_to_linear
 from mi_ring.plugins.properties import LARGEST
 from mi_ring.scene.shot import Encoding, Shot
 
@@ -71,7 +71,7 @@ def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
     require_header(path, field, shot, scene)
     what = f'photograph "{shot.name}", {field}'
     with reading(f"{path}: {what}", "an image"):
-        pixels = read_image(path)
+        pixels = read_image(path, heed=shot.encoding == "auto" and field in ("filename", "ambient"))
     if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
         raise InputError(f"{path}: {what}: contains pixels that are NaN, infinite or above {LARGEST:g}")
     return pixels
@@ -137,6 +137,4 @@ def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
     if itself and pixels.shape[2] not in (2, 4):
         raise InputError(f'{file}: photograph "{shot.name}", {field}: is the photograph itself, which has no '
                          "alpha channel")  # fmt: skip
-    channel = pixels[:, :, -1 if itself else 0]
-    full = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(pixels.dtype, 1)
-    return (channel.astype(np.float32) * (255 / full)).round().astype(np.uint8)
+    return mask_values(pixels[:, :, -1:] if itself else pixels)

@@ -61,6 +61,15 @@ class Lens:
         rays = np.array([[x, y, 1.0] for x in (-0.3, 0.2) for y in (-0.1, 0.4)])
         return np.allclose(self.colmap.img_from_cam(rays), rays[:, :2] * self.focal + self.centre, atol=1e-6)
 
+    def scaled(self, size: tuple[int, int]) -> "Lens":
+        """The lens for photographs that were reduced or enlarged to `size` (width, height) [px]."""
+        if self.model == "PINHOLE":
+            return Lens("PINHOLE", size, tuple(np.tile(np.divide(size, self.size), 2) * self.params))
+        camera = self.colmap  # cached: a copy is changed
+        camera = type(camera)(camera.todict())
+        camera.rescale(*size)
+        return Lens(self.model, size, tuple(camera.params))
+
     def camera(self, pose: np.ndarray) -> Camera:
         """The camera of the undistorted photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
         return Camera(pose @ MITSUBA, np.array(self.focal), np.array(self.centre), self.size)

@@ -1,5 +1,6 @@
 """COLMAP's sparse models, text or binary."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os.path import splitext
@@ -10,9 +11,10 @@ from mi_ring.foreign import require_readable
 from mi_ring.importers.camera_models import Lens, camera_to_world
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import existing
+from mi_ring.importers.reading import read_as
 from mi_ring.system.optional import need
 
+NUMBER = re.compile(rb"[-+.\deE]+|nan|-?inf", re.I)
 #: Python code that reads a model, for `require_readable`.
 READ_MODEL = """
 import pycolmap
@@ -25,19 +27,34 @@ pycolmap.Reconstruction(sys.argv[1])
 class Colmap(Photogrammetry):
     """COLMAP, text or binary. The light is beside the camera.
 
-    SRC is the folder of the model (cameras, images), or a folder with the model in sparse/0 or sparse.
+    SRC is the folder of the model (cameras, images), or a folder with models in sparse/0, sparse/1, … or sparse. Of
+    several the one with the most photographs is taken.
     """
 
     @staticmethod
     def model(src: Path) -> Path | None:
-        """The folder of the model; None if there is no model."""
-        folders = (src, src / "sparse" / "0", src / "sparse")
-        return next((f for f in folders if (f / "images.bin").is_file() or (f / "images.txt").is_file()), None)
+        """The folder of the model with the most photographs; None if there is no model."""
+        inside = ((src / inner).glob("*") for inner in ("sparse", "colmap/sparse", "."))
+        for places in ([src], [src / "sparse"], *inside):
+            if models := sorted(filter(is_model, places)):
+                return max(models, key=count_images)
+        return None
 
-    def posed(self) -> Iterator[tuple[str, Frame]]:
+    @property
+    def folder(self) -> Path:
+        places = [self.src, *(self.model(self.src) or self.src).parents[:3]]
+        return self.images or next((f / "images" for f in places if (f / "images").is_dir()), self.src)
+
+    def posed(self) -> Iterator[Frame]:
         model = self.model(self.src)
         if model is None:
             raise InputError(f"{self.src}: SRC: neither images.bin nor images.txt, nor a folder sparse/0 with them")
+        require_points(model)
+        if model.name.isdigit():
+            others = [folder for folder in sorted(model.parent.iterdir()) if is_model(folder) and folder != model]
+            if sizes := ", ".join(f"{folder} ({count_images(folder)})" for folder in others):
+                self.notes.append(f"Of COLMAP's models {model} is taken, with {count_images(model)} photographs; not "
+                                  f"used: {sizes}")  # fmt: skip
         pycolmap = need("pycolmap", f"{model}")
         if size := sum(file.stat().st_size for file in model.glob("*.bin")):
             require_readable(READ_MODEL, model, size, "a COLMAP model")
@@ -50,23 +67,47 @@ class Colmap(Photogrammetry):
             raise InputError(f"{model}: not a COLMAP model ({' '.join(str(error).split())})") from error
         if not registered:
             raise InputError(f"{model}: images: no photograph has a pose")
-        candidates = [f / "images" for f in (self.src, model, model.parent, model.parent.parent)]
-        images = self.images or next((f for f in candidates if f.is_dir()), None)
-        if images is None and self.photographs is None:
-            raise InputError(f"{self.src}: --images: no folder images beside or above {model}; give it")
         for name, k in names:
             image = reconstruction.images[k]
             if k not in registered:
                 self.without_pose.add(name)
                 continue
-            if images and self.photographs is None:
-                path: Path | None = existing(images / name, "photograph")
-            else:
-                path = self.photograph(name, str(model))
-            if path is None:
+            if (path := self.photograph(name, str(model))) is None:
                 continue
             world_to_camera = image.cam_from_world().matrix()
             pose = camera_to_world(world_to_camera[:, :3], world_to_camera[:, 3])
             camera = reconstruction.cameras[image.camera_id]
             lens = Lens(camera.model_name, (camera.width, camera.height), camera.params)
-            yield name, Frame(path, lens, pose, name=Path(splitext(name)[0]).as_posix().replace("/", "_"))
+            yield Frame(path, lens, pose, name=Path(splitext(name)[0]).as_posix().replace("/", "_"), said=name)
+
+
+def is_model(folder: Path) -> bool:
+    """Does a folder have the images of a model?"""
+    return any((folder / name).is_file() for name in ("images.bin", "images.txt"))
+
+
+def camera_lines(path: Path) -> Iterator[tuple[int, list[bytes]]]:
+    """Number and words of the line after each camera's line in images.txt: the one of its points."""
+    lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
+    for number, line in lines:
+        if line.strip() and not line.lstrip().startswith(b"#"):
+            yield number + 1, next(lines, (0, b""))[1].split()
+
+
+def count_images(folder: Path) -> int:
+    """The number of photographs that a model declares."""
+    binary = folder / "images.bin"
+    if binary.is_file():
+        with binary.open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    return sum(1 for _ in camera_lines(folder / "images.txt"))
+
+
+def require_points(folder: Path) -> None:
+    """Raise InputError if a camera in images.txt has no line of points, where COLMAP would lose the next camera."""
+    if (folder / "images.bin").is_file():
+        return
+    for number, words in camera_lines(path := folder / "images.txt"):
+        if len(words) % 3 or not all(map(NUMBER.fullmatch, words[:30])):
+            raise InputError(f"{path}: line {number}: must be the points of the camera in the line before; put an "
+                             "empty line after each camera")  # fmt: skip

@@ -2,10 +2,16 @@
 
 import contextlib
 import shutil
+from collections import Counter
+from collections.abc import Sequence
 
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
+from mi_ring.colour_profiles import Statement
 from mi_ring.errors import InputError
-from mi_ring.importers.frames import Frame, Source, frames_of, require_frames
+from mi_ring.images import bits_of, statement_of
+from mi_ring.importers.frames import Frame, Source, adapt_all, frames_of, require_frames
+from mi_ring.importers.named_photographs import counted, few
+from mi_ring.importers.photograph_files import parts_of, stem_of
 from mi_ring.importers.writer import Writer, write_frame
 from mi_ring.scene.shot import Shot
 from mi_ring.system.progress import progress
@@ -14,10 +20,11 @@ from mi_ring.system.progress import progress
 def write_scene(source: Source) -> list[Frame]:
     """Write a source's scene file and changed images, and return the frames. After an InputError nothing is written."""
     frames = frames_of(source)
-    if source.without_pose and not frames:
-        raise InputError(f"{source.src}: SRC: none of {len(source.without_pose)} photographs has a pose")
+    require_most(source, frames)
+    adapt_all(source, frames)
     require_frames(frames, source.src)
-    names = [frame.name or frame.image.stem for frame in frames]
+    # Scene files take a $ for a parameter.
+    names = [(frame.name or frame.image.stem).replace("$", "_") for frame in frames]
     if len({*names, "object"}) <= len(names):
         names = [f"{k:0{len(str(len(frames)))}}_{name}" for k, name in enumerate(names)]
     root = scene_element()
@@ -29,6 +36,9 @@ def write_scene(source: Source) -> list[Frame]:
             for frame, name in zip(progress(frames, "converting", unit="photograph", disable=None), names):
                 encoding = source.encoding if source.encoding != "auto" else frame.encoding
                 files = write_frame(writer, frame, name, source.copy, encoding)
+                if file := next((file for file in files if file and "$" in str(file)), None):
+                    raise InputError(f"{file}: has a $ in its path, which scene files take for a parameter; rename it, "
+                                     "or give --copy")  # fmt: skip
                 root.append(photograph_element(Shot(name, frame.camera, frame.light, files=files, encoding=encoding,
                                                     saturation=frame.saturation)))  # fmt: skip
             if truth := getattr(source, "truth", None):
@@ -37,3 +47,55 @@ def write_scene(source: Source) -> list[Frame]:
     except OSError as error:
         raise InputError(f"{source.scene}: cannot be written ({error.strerror or error})") from error
     return frames
+
+
+def require_most(source: Source, frames: Sequence[Frame]) -> None:
+    """Raise InputError if no photograph has a pose, or if most cameras have no photograph."""
+    if source.without_pose and not frames and not source.without_photograph:
+        raise InputError(f"{source.src}: SRC: none of {len(source.without_pose)} photographs has a pose")
+    if (lost := len(source.without_photograph)) > len(frames):
+        raise InputError(f"{source.src}: SRC: {lost} of {lost + len(frames)} cameras have no photograph in "
+                         f"{source.folder}: {few(source.without_photograph)}; give --images, the folder of the "
+                         "photographs")  # fmt: skip
+
+
+def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
+    """What the scene file takes for granted: encoding, lens, light and exposure."""
+    given = [source.encoding if source.encoding != "auto" else frame.encoding for frame in frames]
+    files = [frame.image for frame, encoding in zip(frames, given) if encoding == "auto" and frame.pixels is None]
+    bits = Counter(bits_of(file) for file in files)
+    profiles = sum(statement_of(file) != Statement() for file in files)
+    found = [f"{bits[8]} files of 8 bits are sRGB"] if bits[8] else []
+    found += [f"{more} files of more bits are linear"] if (more := len(files) - bits[8]) else []
+    found += [f"except as {profiles} of the files say themselves"] if profiles else []
+    found += [f"photographs are {what}, as said" for what in sorted({*given} - {"auto"})]
+    curved = sum(not frame.lens.is_pinhole for frame in frames)
+    found.append(f"distortion removed from {curved} photographs" if curved else "no lens distortion")
+    lights = [frame.light for frame in frames]
+    if not any(lights):
+        found.append("light at the camera, of the same strength in all")
+    else:
+        strength = len({light.rgb.tobytes() for light in lights if light})
+        found.append(f"lights of {strength} strengths" if strength > 1 else "lights of the same strength in all")
+    return found
+
+
+def report(source: Source, frames: Sequence[Frame]) -> str:
+    """What was left out and why, what was used, and what was assumed: one line each."""
+    lines = list(source.notes)
+    total = len(frames) + len(source.without_pose)
+    if source.without_pose:
+        lines.append(f"{len(source.without_pose)} of {total} photographs left out, without a pose: "
+                     f"{few(source.without_pose)}")  # fmt: skip
+    if source.without_photograph:
+        lines.append(f"{counted(source.without_photograph, 'camera')} left out, without a photograph in "
+                     f"{source.folder}: {few(source.without_photograph)}")  # fmt: skip
+    used = {frame.image for frame in frames} | {frame.mask for frame in frames}
+    posed = {stem_of(parts_of(name)[-1]) for name in source.without_pose if parts_of(name)}
+    if unused := [f.name for f in source.available if f not in used and stem_of(parts_of(f.name)[-1]) not in posed]:
+        lines.append(f"{counted(unused, 'image')} in {source.folder} left out, without a camera: {few(unused)}")
+    masked = sum(frame.mask is not None for frame in frames)
+    lines.append(f"{len(frames)} photographs, {masked} with masks, of {len({f.pose.tobytes() for f in frames})} "
+                 f"cameras: {source.scene}")  # fmt: skip
+    lines.append(f"Assumed: {'; '.join(assumptions(source, frames))}")
+    return "\n".join(lines)

@@ -1,9 +1,10 @@
 """Frames, the output of all importers: photographs with their cameras and lights."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -13,7 +14,7 @@ from tyro.conf import Positional, Suppress, arg
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.importers.camera_models import Lens
-from mi_ring.importers.reading import image_size
+from mi_ring.importers.reading import image_size, orientation_of
 from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
@@ -35,6 +36,8 @@ class Frame:
     name: str = ""  #: in the scene; empty: the file's name without suffix
     pixels: np.ndarray | None = None  #: (H, W, 3) float32, if `image` is a stack of photographs
     fill_mask: bool = False  #: fill the holes in the mask
+    said: str = ""  #: the path of the photograph in the other tool's file; empty if that names no photographs
+    orientation: int = 1  #: EXIF orientation by which the file's pixels are to be turned
 
     @property
     def camera(self) -> Camera:
@@ -44,14 +47,6 @@ class Frame:
     def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
         """Make a point light of intensity `rgb`. `offset`: from the camera, in the camera's axes [scene units]."""
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
-
-
-def find_by_name(name: str, files: Sequence[Path]) -> Path | None:
-    """Find the file with this name, in any folder and with any suffix; None if there is none."""
-    name = PureWindowsPath(name).name
-    stem = PureWindowsPath(name).stem
-    found = [file for file in files if file.name == name or file.stem in (name, stem)]
-    return min(found, key=lambda file: (file.name != name, file.stem != name), default=None)
 
 
 @dataclass(frozen=True)
@@ -81,6 +76,26 @@ class Source:
         """The names of photographs without a pose. It is complete when all `frames` have been read."""
         return set()
 
+    @cached_property
+    def without_photograph(self) -> list[str]:
+        """Names of the cameras without a photograph. It is complete when all `frames` have been read."""
+        return []
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """Sentences for the user about what was chosen or not used. Complete when all `frames` have been read."""
+        return []
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the photographs."""
+        return self.src
+
+    @property
+    def available(self) -> Sequence[Path]:
+        """The files that may be photographs; empty if the format takes all that it finds."""
+        return []
+
 
 def frames_of(source: Source) -> list[Frame]:
     """Read all frames of a source. Any error of its reader becomes an InputError."""
@@ -93,6 +108,36 @@ def frames_of(source: Source) -> list[Frame]:
         raise InputError(f"{source.src}: SRC: is damaged, or not of this format ({what})") from error
 
 
+def is_scaled(size: Sequence[int], original: Sequence[int]) -> bool:
+    """May `size` (width, height) [px] be that of the original photograph, reduced or enlarged by at least 5 %?"""
+    factor = max(size) / max(original)
+    return abs(factor - 1) > 0.05 and all(abs(a - factor * b) <= 1 for a, b in zip(size, original))
+
+
+def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
+    """Fit a frame's lens to its file: `size` (width, height) [px] as stored, and EXIF `orientation`.
+
+    Returns what was done, for the user; empty if nothing was. A camera of another size is left as it is.
+    """
+    done = ""
+    if size != frame.lens.size and orientation > 4 and (
+        size[::-1] == frame.lens.size or is_scaled(size[::-1], frame.lens.size)
+    ):  # fmt: skip
+        frame.orientation, size = orientation, size[::-1]
+        done = "photographs turned upright by EXIF, as their cameras are"
+    if size != frame.lens.size and is_scaled(size, frame.lens.size):
+        done += "; " * bool(done) + "cameras scaled from {} x {} to the {} x {} pixels of their photographs".format(
+            *frame.lens.size, *size)  # fmt: skip
+        frame.lens = frame.lens.scaled(size)
+    return done
+
+
+def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
+    """`adapt` the frames to their files. Notes of the source say what was done."""
+    done = [adapt(f, image_size(f.image), orientation_of(f.image)) for f in frames if f.pixels is None]
+    source.notes.extend(f"{count} {what}" for what, count in Counter(filter(None, done)).items())
+
+
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise InputError like `require_cameras`, if there are no frames, or if sizes of file and camera differ."""
     if not frames:
@@ -100,9 +145,15 @@ def require_frames(frames: Sequence[Frame], source: Path) -> None:
     require_cameras(frames)
     for frame in frames:
         for file, kind in ((None if frame.pixels is not None else frame.image, "photograph"), (frame.mask, "mask")):
-            if file and (size := image_size(file)) != frame.lens.size:
-                sizes = *size, *frame.lens.size
-                raise InputError("{}: {}: is {} x {} pixels, but its camera {} x {}".format(file, kind, *sizes))
+            if not file or (size := image_size(file)) == frame.lens.size:
+                continue
+            if frame.orientation > 4 and size == frame.lens.size[::-1]:
+                continue  # is turned when it is written
+            why = "give photographs of the size of the cameras, or reduced ones"
+            if size == frame.lens.size[::-1]:
+                why = "the sides are exchanged: give the photographs as the other tool read them, turned or not turned"
+            sizes = *size, *frame.lens.size
+            raise InputError("{}: {}: is {} x {} pixels, but its camera {} x {}; {}".format(file, kind, *sizes, why))
 
 
 def require_cameras(frames: Sequence[Frame]) -> None:

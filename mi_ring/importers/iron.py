@@ -2,30 +2,41 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from os.path import splitext
+from pathlib import Path
 
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
-from mi_ring.importers.frames import Frame, Source
-from mi_ring.importers.reading import first_file, image_size, load_json, matrix, with_suffix
+from mi_ring.importers.frames import Frame
+from mi_ring.importers.named_photographs import NamedPhotographs
+from mi_ring.importers.reading import first_file, image_size, load_json, matrix
 
 
 @dataclass(frozen=True)
-class Iron(Source):
+class Iron(NamedPhotographs):
     """IRON: cam_dict_norm.json beside a folder image. The light is at the camera.
 
     SRC is that folder, or a folder that has it as train.
     """
 
-    def frames(self) -> Iterator[Frame]:
-        path = first_file([f / "cam_dict_norm.json" for f in (self.src, self.src / "train")], "SRC")
+    @property
+    def cameras(self) -> Path:
+        """The file of the cameras."""
+        return first_file([f / "cam_dict_norm.json" for f in (self.src, self.src / "train")], "SRC")
+
+    @property
+    def folder(self) -> Path:
+        return self.images or self.cameras.parent / "image"
+
+    def posed(self) -> Iterator[Frame]:
+        path = self.cameras
         cameras = load_json(path)
         if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
             raise InputError(f"{path}: must be an object with an object K, W2C, img_size for each photograph")
         for key in sorted(cameras):  # the keys end in .png, but the files may have another suffix
-            image = with_suffix(path.parent / "image" / splitext(key)[0], f"{path}: {key}")
+            if (image := self.photograph(key, f"{path}: {key}")) is None:
+                continue
             K = matrix(cameras[key].get("K"), (16,), f"{path}: {key}.K").reshape(4, 4)
             to_camera = matrix(cameras[key].get("W2C"), (16,), f"{path}: {key}.W2C").reshape(4, 4)
             size = matrix(cameras[key].get("img_size", image_size(image)), (2,), f"{path}: {key}.img_size")
             pose = camera_to_world(to_camera[:3, :3], to_camera[:3, 3])
-            yield Frame(image, pinhole_lens(K, size, 0.0, f"{path}: {key}.K"), pose)
+            yield Frame(image, pinhole_lens(K, size, 0.0, f"{path}: {key}.K"), pose, said=key)

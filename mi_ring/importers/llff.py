@@ -21,7 +21,7 @@ class Llff(Photogrammetry):
     the order of the poses.
     """
 
-    def posed(self) -> Iterator[tuple[str, Frame]]:
+    def posed(self) -> Iterator[Frame]:
         path = existing(self.src / "poses_bounds.npy", "SRC")
         array = load_npy(path)
         if array.ndim != 2 or array.shape[1] != 17:
@@ -43,4 +43,4 @@ class Llff(Photogrammetry):
                 raise InputError(f"{image}: is {size[0]} x {size[1]} pixels, not proportional to the {width:g} x "
                                  f"{height:g} of pose {k} in {path.name}")  # fmt: skip
             params = (focal * size[0] / width, focal * size[1] / height, size[0] / 2, size[1] / 2)
-            yield image.name, Frame(image, Lens("PINHOLE", size, params), pose)
+            yield Frame(image, Lens("PINHOLE", size, params), pose, said=image.name)

@@ -13,6 +13,7 @@ from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_xml, matrix
 
+KINDS = ("frame", "fisheye")  #: of sensors
 MAX_SKEW = 0.1  #: largest shift of a pixel by b2 [px]
 
 
@@ -24,7 +25,7 @@ class Metashape(Photogrammetry):
     pose.
     """
 
-    def posed(self) -> Iterator[tuple[str, Frame]]:
+    def posed(self) -> Iterator[Frame]:
         chunk = find_chunk(load_xml(self.src))
         if chunk is None:
             raise InputError(f"{self.src}: SRC: is no <document> with a <chunk>; must be what File > Export > Export "
@@ -36,6 +37,9 @@ class Metashape(Photogrammetry):
             what = f"{self.src}: camera {(label or camera.get('id'))!r}"
             if not label:
                 raise InputError(f"{what}: label: is missing; must be the name of a photograph")
+            if camera.get("master_id") not in (None, camera.get("id")):
+                raise InputError(f"{what}: master_id: is {camera.get('master_id')!r}, of a rig, which is not supported"
+                                 "; export the cameras as COLMAP or Bundler, where each has its own pose")  # fmt: skip
             if camera.find("transform") is None or camera.get("enabled") in ("0", "false"):
                 self.without_pose.add(label)
                 continue
@@ -49,7 +53,8 @@ class Metashape(Photogrammetry):
             if transform is not None:
                 pose = in_world(pose, transform, f"{self.src}: transform")
             if image := self.photograph(label, what):
-                yield image.name, Frame(image, lens_of(sensor, f"{self.src}: sensor {sensor.get('id')!r}"), pose)
+                lens = lens_of(sensor, f"{self.src}: sensor {sensor.get('id')!r}")
+                yield Frame(image, lens, pose, said=label)
 
 
 def find_chunk(root: ElementTree.Element) -> ElementTree.Element | None:
@@ -85,7 +90,10 @@ def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.
 
 
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
-    """Read the lens of a sensor. The formulas are in appendix D of Metashape's manual."""
+    """The lens of a sensor. The formulas are in appendix D of Metashape's manual."""
+    if sensor.get("type", "frame") not in KINDS:  # a panorama has no calibration
+        raise InputError(f"{what}: type: is {sensor.get('type')!r}; must be frame or fisheye; leave such "
+                         "photographs out")  # fmt: skip
     calibration = sensor.find("calibration[@class='adjusted']")
     if calibration is None:
         calibration = sensor.find("calibration")

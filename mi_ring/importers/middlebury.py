@@ -17,7 +17,7 @@ class Middlebury(Photogrammetry):
     SRC is that file or its folder.
     """
 
-    def posed(self) -> Iterator[tuple[str, Frame]]:
+    def posed(self) -> Iterator[Frame]:
         files = sorted(self.src.glob("*_par.txt")) if self.src.is_dir() else [self.src]
         if len(files) != 1:
             raise InputError(f"{self.src}: SRC: has {len(files)} files *_par.txt; must have one, or give the file")
@@ -32,4 +32,4 @@ class Middlebury(Photogrammetry):
             K, R, t = values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:]
             if image := self.photograph(name, what):
                 lens = pinhole_lens(K, image_size(image), 0.5, what)  # pixels as in OpenCV
-                yield image.name, Frame(image, lens, camera_to_world(R, t))
+                yield Frame(image, lens, camera_to_world(R, t), said=name)

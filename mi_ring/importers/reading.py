@@ -1,19 +1,20 @@
 """Readers of other tools' files. Each raises InputError for a missing, damaged or unexpected file."""
 
 import json
-from collections.abc import Callable, Collection, Mapping
+import os
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
 import scipy.io
+from PIL import ExifTags
 
 from mi_ring import images
 from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading, require_readable
 
-SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".jpg", ".jpeg")  #: of photographs
 Content = TypeVar("Content")
 
 
@@ -23,9 +24,9 @@ def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
         return read(existing(path, what))
 
 
-def pixels_of(path: Path) -> np.ndarray:
-    """Read the pixels (H, W, C) of an image file."""
-    return read_as(path, "image", images.read_image)
+def pixels_of(path: Path, heed: bool = False) -> np.ndarray:
+    """Pixels (H, W, C) of an image file. `heed`: as for `images.read_image`."""
+    return read_as(path, "image", lambda file: images.read_image(file, heed))
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -33,12 +34,26 @@ def image_size(path: Path) -> tuple[int, int]:
     return read_as(path, "image", images.image_size)
 
 
+def orientation_of(path: Path) -> int:
+    """The EXIF orientation by which the pixels that we read are to be turned; 1 if there is none."""
+    if path.suffix.lower() in (*images.HEIF, *images.RAW):  # their readers turn them
+        return 1
+    value = read_as(path, "image", images.exif_of).get(ExifTags.Base.Orientation)
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
 def has_alpha(path: Path) -> bool:
-    """Does an image file have an alpha channel?"""
-    if path.suffix.lower() == ".exr":
-        return pixels_of(path).shape[2] in (2, 4)
-    with reading(path, "image"), images.open_image(existing(path, "image")) as image:
-        return image.mode in ("LA", "RGBA")
+    """Does an image file have an alpha channel that is not opaque everywhere?"""
+    suffix = path.suffix.lower()
+    if suffix not in (".exr", *images.TIFF):
+        if suffix in (".jpg", ".jpeg", *images.RAW):
+            return False
+        with reading(path, "image"), images.open_image(existing(path, "image")) as image:
+            if not image.has_transparency_data:
+                return False
+    pixels = pixels_of(path)
+    full = 1.0 if pixels.dtype == np.float32 else np.iinfo(pixels.dtype).max
+    return pixels.shape[2] in (2, 4) and bool((pixels[..., -1] < full).any())
 
 
 def existing(path: Path, field: str) -> Path:
@@ -55,17 +70,30 @@ def first_file(candidates: list[Path], field: str) -> Path:
     raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
 
 
-def with_suffix(path: Path, field: str) -> Path:
-    """Find the image file at `path`, or with one of `SUFFIXES` appended. Raises InputError if none exists."""
-    candidates = [path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES if path.name)]
-    if file := next(filter(is_file, candidates), None):
-        return file
-    raise InputError(f"{field}: no such file: {path}, nor with any of {' '.join(SUFFIXES)}")
-
-
 def list_images(folder: Path) -> list[Path]:
-    """List the image files in a folder, sorted by name."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES and is_file(path))
+    """The image files in a folder, sorted by name, without hidden ones."""
+    return without_raw_twins(path for path in folder.glob("[!.]*") if is_image(path))
+
+
+def images_below(folder: Path) -> list[Path]:
+    """The image files in a folder and the folders below it, sorted, without hidden ones."""
+    found = []
+    for place, inner, files in os.walk(folder):
+        inner[:] = [name for name in inner if not name.startswith(".")]
+        found += [Path(place, name) for name in files if not name.startswith(".")]
+    return without_raw_twins(filter(is_image, found))
+
+
+def is_image(path: Path) -> bool:
+    """Is there such a file, with a suffix of image files?"""
+    return path.suffix.lower() in images.SUFFIXES and is_file(path)
+
+
+def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
+    """The paths, sorted, without raw files and HEIC beside an image of another format with the same name."""
+    found = sorted(paths)
+    others = {path.with_suffix("") for path in found if path.suffix.lower() not in images.RAW + images.HEIF}
+    return [p for p in found if p.with_suffix("") not in others or p.suffix.lower() not in images.RAW + images.HEIF]
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:

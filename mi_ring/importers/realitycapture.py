@@ -31,11 +31,11 @@ class RealityCapture(Photogrammetry):
     have one of the Brown models.
     """
 
-    def posed(self) -> Iterator[tuple[str, Frame]]:
+    def posed(self) -> Iterator[Frame]:
         return self.from_sidecars() if self.src.is_dir() else self.from_csv()
 
-    def from_sidecars(self) -> Iterator[tuple[str, Frame]]:
-        """Read the photographs x.jpg that have a sidecar x.xmp with a pose."""
+    def from_sidecars(self) -> Iterator[Frame]:
+        """The photographs x.jpg that have a sidecar x.xmp with a pose."""
         if not any(self.src.glob("*.xmp")):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
@@ -44,17 +44,16 @@ class RealityCapture(Photogrammetry):
             path = self.src / f"{image.stem}.xmp"
             fields = xmp_fields(load_xml(path)) if path.is_file() else {}
             if "Rotation" in fields and "Position" in fields:
-                yield image.name, sidecar_frame(image, fields, str(path))
+                yield sidecar_frame(image, fields, str(path))
             else:
                 self.without_pose.add(image.name)
 
-    def from_csv(self) -> Iterator[tuple[str, Frame]]:
-        """Read the photographs in the rows of a CSV file."""
+    def from_csv(self) -> Iterator[Frame]:
+        """The photographs in the rows of a CSV file."""
         columns, rows = read_csv(self.src)
         if missing := [name for name in ("name", *POSE, "f") if name not in columns]:
             raise InputError(f"{self.src}: column {missing[0]}: is missing; must be the table of internal and external "
                              "camera parameters")  # fmt: skip
-        seen = set()
         for line, row in enumerate(rows, 1):
             what = f"{self.src}: camera {line}"
             if len(row) != len(columns):
@@ -63,15 +62,14 @@ class RealityCapture(Photogrammetry):
             numbers = {name: float(matrix(cells[name], (), f"{what}: {name}")) for name in columns if name in NUMBERS}
             if (image := self.photograph(cells["name"], what)) is None:
                 continue
-            seen.add(image)
             pose = np.eye(4)
             # At zero angles the camera looks down and its top points to y. The heading is clockwise, as on a compass.
             angles = [-numbers["heading"], numbers["pitch"], numbers["roll"]]
             pose[:3, :3] = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix() @ OPENGL[:3, :3]
             pose[:3, 3] = [numbers[name] for name in POSE[:3]]
             terms, centre = ([numbers.get(name, 0.0) for name in names] for names in (TERMS, ("px", "py")))
-            yield image.name, Frame(image, film_lens(image, numbers["f"], centre, terms, what), pose)
-        self.without_pose.update(image.name for image in self.image_files if image not in seen)
+            lens = film_lens(image, numbers["f"], centre, terms, what)
+            yield Frame(image, lens, pose, said=cells["name"])
 
 
 def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
@@ -95,7 +93,7 @@ def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
         length = 3 if count == len(texts) == 3 else 6
         terms[:count] = matrix(texts, (length,), f"{what}: xcr:DistortionCoeficients")[:count]
     lens = film_lens(image, numbers("FocalLength35mm", 1)[0], centre, terms.tolist(), what)
-    return Frame(image, lens, camera_to_world(R, -R @ position))
+    return Frame(image, lens, camera_to_world(R, -R @ position), said=image.name)
 
 
 def xmp_fields(root: ElementTree.Element) -> dict[str, str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_ring.errors import InputError, is_file
+from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -28,14 +28,14 @@ class SfmData(Photogrammetry):
     SRC is the file. It names the photographs; if they were moved, give --images.
     """
 
-    def posed(self) -> Iterator[tuple[str, Frame]]:
+    def posed(self) -> Iterator[Frame]:
         top = load_json(self.src)
         if not isinstance(top, dict) or not isinstance(top.get("views"), list):
             raise InputError(f"{self.src}: views: is missing; must be a scene of Meshroom or OpenMVG")
         yield from self.openmvg(top) if "extrinsics" in top or "root_path" in top else self.alicevision(top)
 
-    def alicevision(self, top: dict) -> Iterator[tuple[str, Frame]]:
-        """Read the photographs of a scene of Meshroom."""
+    def alicevision(self, top: dict) -> Iterator[Frame]:
+        """The photographs of a scene of Meshroom."""
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
         poses = self.by_key(top, "poses", "poseId")
@@ -59,8 +59,8 @@ class SfmData(Photogrammetry):
             lens = alicevision_lens(intrinsic, version, f"{self.src}: intrinsic {key!r}")
             yield from self.frame(file, lens, pose, what)
 
-    def openmvg(self, top: dict) -> Iterator[tuple[str, Frame]]:
-        """Read the photographs of a scene of OpenMVG. Its library cereal names polymorphic types only at first use."""
+    def openmvg(self, top: dict) -> Iterator[Frame]:
+        """The photographs of a scene of OpenMVG. Its library cereal names a polymorphic type only at its first use."""
         root = str(top.get("root_path", ""))
         intrinsics, types = self.by_key(top, "intrinsics", "key"), {}
         for own in intrinsics.values():
@@ -92,12 +92,10 @@ class SfmData(Photogrammetry):
             raise InputError(f"{self.src}: {name}: must be a list")
         return {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
 
-    def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[tuple[str, Frame]]:
-        """Make the frame of a photograph, which may have been moved; nothing if it is not in `photographs`."""
-        path = self.src.parent / file
-        own = path if is_file(path) and not self.images and self.photographs is None else self.photograph(file, what)
-        if own:
-            yield own.name, Frame(own, lens, pose)
+    def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[Frame]:
+        """The frame of a photograph, which may have been moved; nothing if there is no such photograph."""
+        if own := self.photograph(file, what, relative=True):
+            yield Frame(own, lens, pose, said=file)
 
 
 def require_object(value: Any, what: str) -> dict:

@@ -9,19 +9,40 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError
-from mi_ring.importers.camera_models import Lens, opencv_lens
-from mi_ring.importers.frames import OPENGL, Frame, Light, Source, find_by_name
-from mi_ring.importers.reading import existing, first_file, has_alpha, image_size, load_json, matrix, with_suffix
+from mi_ring.importers.camera_models import Lens, opencv_lens, pinhole_lens
+from mi_ring.importers.frames import OPENGL, Frame, Light
+from mi_ring.importers.named_photographs import NamedPhotographs
+from mi_ring.importers.reading import first_file, image_size, images_below, load_json, matrix
+
+#: Fields of the file and of its frames that are used.
+USED = {
+    "file_path", "img_path", "transform_matrix", "mask_path", "pl_pos", "pl_intensity", "w", "h", "fl_x", "fl_y", "cx",
+    "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "camera_intrinsics", "intrinsic_matrix", "from_na",
+    "camera_model", "is_fisheye", "k1", "k2", "k3", "k4", "p1", "p2",
+}  # fmt: skip
+#: Fields of lenses that are refused where they are not 0.
+REFUSED = ("rolling_shutter", "ftheta_p0", "lens_mode", "p3", "p4", "k5", "k6", "s1", "s2", "s3", "s4")
+#: Fields that change nothing: the place of the scene in instant-ngp's box, other maps, what was applied already.
+HARMLESS = {
+    "aabb_scale", "aabb", "scale", "offset", "scene_scale", "n_frames", "sharpness", "rotation", "time", "depth_path",
+    "depth_file_path", "normal_path", "colmap_im_id", "applied_transform", "applied_scale", "ply_file_path", "up",
+    "orientation_override", "auto_scale_poses_override", "train_filenames", "val_filenames", "test_filenames",
+    "render_aabb", "white_transparent", "black_transparent", "timestamp", "camera_label",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Transforms(Source):
+class Transforms(NamedPhotographs):
     """transforms.json of NeRF, instant-ngp, nerfstudio. pl_pos and pl_intensity of its frames are the lights.
 
     SRC is the file, or a folder with transforms.json or transforms_train.json.
     """
 
-    def frames(self) -> Iterator[Frame]:
+    @property
+    def folder(self) -> Path:
+        return self.images or (self.beside if images_below(self.beside) else super().folder)
+
+    def posed(self) -> Iterator[Frame]:
         path = self.src
         if path.is_dir():
             path = first_file([path / "transforms.json", path / "transforms_train.json"], "SRC")
@@ -29,6 +50,7 @@ class Transforms(Source):
         frames = top.get("frames") if isinstance(top, dict) else None
         if not isinstance(frames, list) or not frames:
             raise InputError(f"{path}: frames: found none; must be a list of photographs")
+        unknown: list[str] = []
         for number, own in enumerate(frames):
             where = f"frames[{number}]"
             if not isinstance(own, dict):
@@ -36,20 +58,18 @@ class Transforms(Source):
             name = own.get("file_path", own.get("img_path"))
             if not isinstance(name, str):
                 raise InputError(f"{path}: {where}.file_path: missing; must be the name of an image file")
-            if self.photographs is None:
-                image: Path | None = with_suffix(path.parent / name, f"{path}: {where}.file_path")
-            else:
-                image = find_by_name(name, self.photographs)
-            if image is None:
+            if (image := self.photograph(name, f"{path}: {where}.file_path", relative=True)) is None:
                 continue
-            pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix") @ OPENGL
-            camera = transforms_camera({**top, **own}, image, f"{path}: {where}")
+            fields = {key: value for key, value in top.items() if key != "frames"} | own
+            pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix")
+            if not fields.get("from_na"):  # NeuS2's sign of OpenCV's axes
+                pose = pose @ OPENGL
+            unknown += [key for key in fields if key not in USED | HARMLESS | {*REFUSED}]
+            camera = transforms_camera(fields, image, f"{path}: {where}")
             mask = own.get("mask_path")
-            frame = Frame(image, camera, pose)
+            frame = Frame(image, camera, pose, said=name)
             if mask is not None:
-                frame.mask = existing(path.parent / str(mask), f"{where}.mask_path")
-            elif has_alpha(image):
-                frame.mask = image
+                frame.mask = self.mask_at(str(mask), f"{path}: {where}.mask_path")
             intensity = np.ones(3)
             if (rgb := own.get("pl_intensity")) is not None:
                 rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb
@@ -58,6 +78,8 @@ class Transforms(Source):
             if (position := own.get("pl_pos")) is not None:
                 frame.light = Light("point", matrix(position, (3,), f"{path}: {where}.pl_pos"), intensity)
             yield frame
+        if unknown:
+            self.notes.append(f"{path}: not used, because unknown: {', '.join(dict.fromkeys(unknown))}")
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
@@ -74,14 +96,27 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
 
     size: Any = (number("w"), number("h")) if "w" in given and "h" in given else image_size(image)  # Lens truncates
     width, height = size
-    if given.get("camera_intrinsics") is not None:
+    for name in REFUSED:
+        if any(np.ravel(given.get(name) or 0).tolist()):
+            raise InputError(f"{where}.{name}: is {str(given[name])[:60]}; such lenses are not supported; undistort "
+                             "the photographs first")  # fmt: skip
+    for name, fov in (("camera_angle_x", "x_fov"), ("camera_angle_y", "y_fov")):
+        if fov in given:  # instant-ngp's, in degrees
+            given = {name: math.radians(number(fov))} | given
+    fx: float | None = None
+    fy: float | None = None
+    if (rows := given.get("intrinsic_matrix")) is not None:  # NeuS2's
+        what = f"{where}.intrinsic_matrix"
+        K = matrix(rows, (4, 4) if isinstance(rows, list) and len(rows) == 4 else (3, 3), what)
+        fx, fy, cx, cy = pinhole_lens(K[:3, :3], size, 0.0, what).params
+    elif given.get("camera_intrinsics") is not None:
         cx, cy, fx, fy = matrix(given["camera_intrinsics"], (4,), f"{where}.camera_intrinsics")
     else:
-        fx = fy = None
-        if "camera_angle_x" in given:
-            fx = fy = 0.5 * width / math.tan(0.5 * angle("camera_angle_x"))
         if "camera_angle_y" in given:
-            fy = 0.5 * height / math.tan(0.5 * angle("camera_angle_y"))
+            fx = fy = 0.5 * height / math.tan(0.5 * angle("camera_angle_y"))
+        if "camera_angle_x" in given:
+            fx = 0.5 * width / math.tan(0.5 * angle("camera_angle_x"))
+            fy = fx if fy is None else fy
         fx = number("fl_x", default=fx)
         fy = number("fl_y", default=fy if "fl_x" not in given else fx)
         cx, cy = number("cx", default=width / 2), number("cy", default=height / 2)

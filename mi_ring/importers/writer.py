@@ -14,9 +14,9 @@ import scipy.ndimage
 
 from mi_ring.capture.decoding import is_linear
 from mi_ring.errors import InputError
-from mi_ring.images import write_image
+from mi_ring.images import oriented, write_image
 from mi_ring.importers.frames import Frame
-from mi_ring.importers.reading import pixels_of
+from mi_ring.importers.reading import image_size, pixels_of
 from mi_ring.importers.undistortion import undistort
 from mi_ring.scene.shot import Encoding, Files
 from mi_ring.system.files import relative_to, write_file
@@ -77,7 +77,7 @@ class Writer:
 
 def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
     """Write the changed files of a frame, or with `copy` all of its files. Returns the files for the scene file."""
-    straight, pixels = frame.lens.is_pinhole, frame.pixels
+    straight, pixels, turn = frame.lens.is_pinhole, frame.pixels, frame.orientation
 
     def place(folder: str, key: Hashable, path: Path, changed: Callable[[], np.ndarray | None]) -> Path:
         if (folder, key) not in writer.shared:
@@ -88,11 +88,11 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
             writer.shared[folder, key] = writer.relative(path)
         return writer.shared[folder, key]
 
-    if pixels is None and (not straight or encoding == "linear"):
-        pixels = pixels_of(frame.image)
+    if pixels is None and (not straight or turn > 1 or encoding == "linear"):
+        pixels = oriented(pixels_of(frame.image, heed=encoding == "auto"), turn)
         if encoding == "linear" and pixels.dtype == np.uint8:  # the scene file would take 8 bits for sRGB
             pixels = pixels * np.uint16(257)
-        elif straight:
+        elif straight and turn == 1:
             pixels = None  # the file can stay
     valid = None
     if not straight:
@@ -107,9 +107,10 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
         return Files(image, image if file else None, valid)
 
     def mask() -> np.ndarray | None:
-        if straight and not frame.fill_mask:
+        turned = turn > 1 and image_size(file) != frame.lens.size
+        if straight and not frame.fill_mask and not turned:
             return None
-        mask = pixels_of(file)
+        mask = oriented(pixels_of(file), turn if turned else 1)
         if frame.fill_mask:
             mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
         return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]

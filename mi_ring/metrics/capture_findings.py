@@ -95,7 +95,7 @@ def measure(
             object=float(inside.mean()) * part if masked else None,
             clipped=float(np.any(saturated, -1)[inside].mean()) if inside.any() else 0.0,
             dark=float((image[inside] < 0.02 * np.quantile(image[inside], 0.95)).mean()) if inside.any() else 1.0,
-            background=None if around is None else around / max(level, 1e-9),
+            background=None if around is None or level < 1e-3 * image.max() else around / level,
             brightness=level / max(received, 1e-30), agreement=agreement.get(capture.outline(k)),
         ))  # fmt: skip
     return rows

@@ -78,18 +78,42 @@ def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
         return 0.0
 
 
+def border(silhouette: Silhouette) -> float:
+    """Share of the pixels at the edge of a photograph that its mask says are object."""
+    mask = silhouette.mask > 127
+    return float(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean())
+
+
+def mistake_in_masks(silhouettes: Sequence[Silhouette]) -> dict[str, Sequence[Silhouette]]:
+    """Mistakes in the masks, as text, and the silhouettes without them."""
+    guesses: dict[str, Sequence[Silhouette]] = {}
+    if np.median([border(silhouette) for silhouette in silhouettes]) > 0.5:  # an object is rarely all around
+        guesses["masks are inverted: 255 is to be the object, 0 the background"] = [
+            s._replace(mask=255 - s.mask) for s in silhouettes]  # fmt: skip
+    if len({silhouette.mask.shape for silhouette in silhouettes}) == 1:
+        for step, other in ((1, "next"), (-1, "previous")):
+            masks = [silhouette.mask for silhouette in (*silhouettes[step:], *silhouettes[:step])]
+            guesses[f"each photograph has the mask of the {other} one: name the masks as the photographs"] = [
+                s._replace(mask=mask) for s, mask in zip(silhouettes, masks)]  # fmt: skip
+    return guesses
+
+
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
     """Find the known mistake in the cameras that explains why masks disagree, and its correction, as text; or None."""
     some = subsample(silhouettes, 32, 96)
+    limit = max(CONFORMS, share_agreed(some) + 0.05)
+    masks = {name: share_agreed(subsample(guess, 32, 96)) for name, guess in mistake_in_masks(silhouettes).items()}
+    if masks and masks[best := max(masks, key=masks.__getitem__)] >= limit:  # before the cameras are blamed
+        return f"{best} (the masks then agree to {masks[best]:.0%})"
     guesses = {name: [change(s) for s in some] for name, change in OTHERS.items()}
     for first, change in MATRICES.items():
         for second, axes in AXES.items():
             name = "; then ".join(part for part in (first, second) if part)
             guesses[name] = [with_camera(s, to_world=change(s.camera.to_world) @ np.diag([*axes, 1.0])) for s in some]
-    unchanged = share_agreed(guesses.pop(""))
+    del guesses[""]
     scores = {name: share_agreed(guess) for name, guess in guesses.items()}
     best = max(scores, key=scores.__getitem__)
-    if scores[best] < max(CONFORMS, unchanged + 0.05):
+    if scores[best] < limit:
         return None
     return f"{best} (the masks then agree to {scores[best]:.0%})"
 

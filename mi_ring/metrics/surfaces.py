@@ -1,5 +1,6 @@
 """Differences of two surfaces: normals, depths and silhouettes in photographs; distances; alignment."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,10 +26,17 @@ THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
 
 
 def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
-    """Load a mesh file: the mesh, and a scene of this mesh only, with smooth normals. Raises InputError."""
+    """A mesh file, and a scene of this mesh only, with smooth normals. Raises InputError if it cannot be read.
+
+    A mesh that is inside out is turned, with a word on standard error.
+    """
     mesh = read_mesh(path, "mesh")
     if not len(mesh.faces):
         raise InputError(f"{path}: mesh: has no triangles; give a surface")
+    outward = np.einsum("ij,ij->i", mesh.triangles_center - mesh.bounds.mean(0), mesh.face_normals) * mesh.area_faces
+    if outward.sum() < -0.5 * np.abs(outward).sum():
+        print(f"{path}: is inside out, its faces look inwards; they are turned", file=sys.stderr)
+        mesh.invert()
     return mesh, scene_of(mesh.vertices, mesh.faces)
 
 

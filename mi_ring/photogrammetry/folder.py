@@ -12,15 +12,28 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
-from mi_ring.foreign import reading, require_plausible_size
-from mi_ring.images import HEIF, PLAIN, RAW, linear_to_srgb, open_image, read_image, srgb_to_linear
-from mi_ring.importers.photogrammetry import exposure_of
+from mi_ring.foreign import reading
+from mi_ring.images import (
+    HEIF,
+    PLAIN,
+    RAW,
+    encoding_of,
+    exif_of,
+    linear_to_srgb,
+    mask_values,
+    open_image,
+    orientation_axes,
+    oriented,
+    read_image,
+    srgb_to_linear,
+)
+from mi_ring.importers.photogrammetry import exposures_of
 from mi_ring.importers.reading import image_size, read_as
 from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 from mi_ring.system.optional import need
 
-TRANSPARENT = (".png", ".tif", ".tiff")  #: suffixes of files that may have an alpha channel
+TRANSPARENT = (".png", ".tif", ".tiff", ".webp", ".avif")  #: suffixes of files that may have an alpha channel
 FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of orientations, and EXIF's
 MIN_PHOTOGRAPHS = 8
 
@@ -50,17 +63,15 @@ class Picture:
     def stored(self) -> np.ndarray:
         """The pixels as the file stores them, before they are turned upright."""
 
-        def develop(raw: Any) -> np.ndarray:
-            require_plausible_size(self.path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
-            # Linear radiance in sRGB's primaries, with the camera's white balance.
-            return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
-
-        if self.suffix in RAW + HEIF:
-            return self.decode(develop if self.suffix in RAW else lambda image: np.array(image.convert("RGB")))
-        pixels = read_as(self.path, "image", read_image)
+        pixels = read_as(self.path, "photograph", partial(read_image, heed=True))
         if pixels.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{self.path}: has {pixels.dtype} pixels; photographs must have 8 or 16 bits")
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
+
+    @property
+    def mask_pixels(self) -> np.ndarray:
+        """(H, W) uint8: the mask in this file, as stored or turned as `pixels`."""
+        return oriented(mask_values(read_as(self.path, "mask", read_image)), self.orientation)
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
         """Call `read` on the opened file: by LibRaw if it is raw, otherwise by Pillow, which turns HEIF upright."""
@@ -95,10 +106,7 @@ class Picture:
     def exif(self) -> Image.Exif:
         """The EXIF data; empty if there is none or it cannot be read."""
         try:
-            with open_image(self.path) as image:
-                exif = image.getexif()
-                exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
-                return exif
+            return exif_of(self.path)
         except Exception:  # damaged data raise many kinds; Pillow does not know all raw formats
             return Image.Exif()
 
@@ -106,16 +114,15 @@ class Picture:
         """The value of a tag in the Exif part of EXIF data; None if it is missing."""
         return self.exif.get_ifd(ExifTags.IFD.Exif).get(tag)
 
-    @cached_property
-    def exposure(self) -> float:
-        """The exposure by EXIF: time · ISO / aperture²; NaN if unknown."""
-        exposure = exposure_of(self.exif.get_ifd(ExifTags.IFD.Exif)) or 0.0
-        return exposure if exposure > 0 else np.nan
-
     @property
+    def raw(self) -> bool:
+        """Is it a raw file, linear and of arbitrary brightness?"""
+        return self.suffix in RAW
+
+    @cached_property
     def encoding(self) -> Encoding:
-        """The encoding of `pixels`: `linear` or `srgb`."""
-        return "linear" if self.suffix in RAW else "srgb"
+        """`linear` or `srgb`: the encoding of `pixels`. What the file says counts; otherwise 8 bits are sRGB."""
+        return "srgb" if read_as(self.path, "photograph", encoding_of) == "srgb" else "linear"
 
     @cached_property
     def size(self) -> tuple[int, int]:
@@ -145,6 +152,8 @@ class Picture:
     @cached_property
     def white(self) -> float:
         """The value of raw pixels that is shown as white (1 = full scale), because their brightness is arbitrary."""
+        if not self.raw:
+            return 1.0
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
     def linear(self) -> np.ndarray:
@@ -166,7 +175,7 @@ class Picture:
                 return None
             mask = self.pixels[:, :, 3]
         elif file := self.mask_file(Path(source)):
-            mask = Picture(file, self.upright).pixels[:, :, 0]
+            mask = Picture(file, self.upright).mask_pixels
             if mask.shape[::-1] != self.size:
                 sizes = *mask.shape[::-1], *self.size
                 raise InputError("{}: is {} x {} pixels, but its photograph {} x {}".format(file, *sizes))
@@ -189,18 +198,6 @@ def rembg() -> Callable[[Image.Image], Image.Image]:
     """rembg's function that makes masks, with its network loaded. Raises InputError if rembg is not installed."""
     package = need("rembg", "--masks rembg")
     return partial(package.remove, session=package.new_session(), only_mask=True)
-
-
-def orientation_axes(orientation: int) -> np.ndarray:
-    """Rotation (3, 3) from the axes (x right, y down, z forward) of stored pixels to those of pixels turned upright."""
-    column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
-    return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
-
-
-def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Turn pixels (H, W, …) by an EXIF orientation."""
-    column, row = orientation_axes(orientation)[:2, :2].sum(1).astype(int)
-    return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation > 4 else pixels)[::row, ::column])
 
 
 def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
@@ -257,14 +254,19 @@ def focal_35mm(pictures: Sequence[Picture]) -> float | None:
 
 
 def without_exposure(pictures: Sequence[Picture]) -> list[str]:
-    """Name the files of photographs without an exposure in EXIF data; empty if no photograph has one."""
-    missing = [picture.path.name for picture in pictures if np.isnan(picture.exposure)]
+    """File names of the photographs without an exposure in EXIF data; empty if no photograph has one."""
+    missing = [p.path.name for p, exposure in zip(pictures, exif_exposures(pictures)) if np.isnan(exposure)]
     return missing if len(missing) < len(pictures) else []
 
 
+def exif_exposures(pictures: Sequence[Picture]) -> np.ndarray:
+    """(N,) exposure time · ISO / aperture² by EXIF, without what no photograph has; NaN if unknown."""
+    return np.array(exposures_of([picture.exif.get_ifd(ExifTags.IFD.Exif) for picture in pictures]))
+
+
 def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.ndarray:
-    """Exposures (N,) by EXIF, relative to their median; the value `unknown` where EXIF has none."""
-    exposures = np.array([picture.exposure for picture in pictures])
+    """(N,) exposures by EXIF, relative to their median; the value `unknown` where EXIF has none."""
+    exposures = exif_exposures(pictures)
     known = np.isfinite(exposures)
     return np.where(known, exposures / np.median(exposures[known]) if known.any() else 1.0, unknown)
 

@@ -1,17 +1,20 @@
-"""Features of the photographs and matches between them, by COLMAP's library."""
+"""Features of the photographs by COLMAP's library, and matches between them by matrix products."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import torch
 from PIL import Image
 
 from mi_ring.errors import InputError
+from mi_ring.nets.chunks import in_parallel
 from mi_ring.photogrammetry.folder import Picture, focal_35mm
-from mi_ring.system.machine import interruptible
+from mi_ring.system.machine import cores, in_threads, interruptible
 from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
@@ -19,38 +22,58 @@ pycolmap = LazyPackage("pycolmap", "structure from motion")
 #: Longer side of the images in which features are searched [px], maximum number of features, and their least contrast.
 #: A smooth object has few strong features: weak ones are kept, and geometric verification removes the wrong ones.
 LONGEST, FEATURES, PEAK = 1600, 4096, 0.003
-ALL_PAIRS = 150  #: all pairs of up to this number of photographs are matched: fewer pairs may mirror cameras
-NEIGHBOURS, KEYS = 12, 40  #: with more photographs: neighbours on each side, and key photographs with each other
-BATCH = 60  #: pairs per call
+DECODED = 2  #: photographs that are decoded at a time
+LENGTH = 512.0  #: of a descriptor
+#: Largest angle between the descriptors of a match [radians], also as a share of the angle to the second nearest one.
+ANGLE, RATIO = 0.7, 0.8
+BLOCK = 512  #: rows of a matrix of products that is computed at a time, so that it stays in the processor's cache
+ALL_PAIRS = 60  #: all pairs of up to this number of photographs are matched
+SIMILAR, NEIGHBOURS = 30, 12  #: with more: each photograph with the most similar ones, and those next to it by name
+WORDS = 4096  #: descriptors to which the others are compared to see which photographs are similar
+BATCH = 60  #: pairs that are verified at a time
 MIN_MATCHES = 50  #: of a pair of photographs that overlap
 #: A pair is static if the features' motion varies by less than STATIC [widths]. MAX_STATIC: largest share of them.
 STATIC, MAX_STATIC = 0.01, 0.9
 
 
 def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Write reduced grey images to `folder`, and their features to the database. Existing files are kept."""
-    options = pycolmap.FeatureExtractionOptions(use_gpu=False)
+    """Write reduced grey images, and their features to the database. Existing ones are kept."""
+    list(progress(extract_features(pictures, folder), "features", len(pictures)))
+
+
+def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Picture]:
+    """The photographs as soon as the database has their features; see `find_features`."""
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=cores())
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
     database, grey = folder / "database.db", folder / "grey"
-    cameras = camera_ids(database)
-    shared: dict[tuple[int, int], int] = {}  # cameras by the size of the photographs
-    focal_lengths = {size: focal_35mm([p for p in pictures if p.size == size]) for size in {p.size for p in pictures}}
-    for picture in progress(pictures, "features"):
-        file = grey_file(picture)
-        if file not in cameras:
-            reduced = Image.fromarray(picture.grey(LONGEST))
-            picture.close()
-            reduced.save(grey / file)
-            reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
-            if picture.size in shared:
-                reader.existing_camera_id = shared[picture.size]
-            elif equivalent := focal_lengths[picture.size]:
-                focal = equivalent / 36 * max(reduced.size)
-                reader.camera_params = f"{focal},{reduced.width / 2},{reduced.height / 2},0"
-            mode = pycolmap.CameraMode.SINGLE
-            interruptible(pycolmap.extract_features, database, grey, [file], mode, reader, options)
-            cameras = camera_ids(database)
-        shared.setdefault(picture.size, cameras[file])
+
+    def write_grey(picture: Picture) -> tuple[int, int]:
+        reduced = Image.fromarray(picture.grey(LONGEST))
+        picture.close()
+        reduced.save(grey / grey_file(picture))
+        return reduced.size
+
+    for size in dict.fromkeys(picture.size for picture in pictures):  # one camera each
+        own = [picture for picture in pictures if picture.size == size]
+        cameras = camera_ids(database)
+        yield from (picture for picture in own if grey_file(picture) in cameras)
+        missing = [picture for picture in own if grey_file(picture) not in cameras]
+        for batch in batches(missing, 4 * cores()):
+            sizes = list(in_threads(write_grey, batch, most=DECODED))
+            reader, cameras = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL"), camera_ids(database)
+            if known := [cameras[file] for file in map(grey_file, own) if file in cameras]:
+                reader.existing_camera_id = known[0]
+            elif equivalent := focal_35mm(own):
+                width, height = sizes[0]
+                reader.camera_params = f"{equivalent / 36 * max(width, height)},{width / 2},{height / 2},0"
+            files, mode = [grey_file(picture) for picture in batch], pycolmap.CameraMode.SINGLE
+            interruptible(pycolmap.extract_features, database, grey, files, mode, reader, options)
+            yield from batch
+
+
+def batches(things: Sequence[Any], count: int) -> Iterator[Sequence[Any]]:
+    """The things, `count` at a time."""
+    return (things[k : k + count] for k in range(0, len(things), count))
 
 
 def grey_file(picture: Picture) -> str:
@@ -66,31 +89,93 @@ def camera_ids(database: Path) -> dict[str, int]:
         return {image.name: image.camera_id for image in opened.read_all_images()}
 
 
-def pairs_to_match(count: int) -> list[tuple[int, int]]:
-    """Choose the pairs of `count` photographs, sorted by name, that are matched."""
-    pairs = itertools.combinations(range(count), 2)
-    if count <= ALL_PAIRS:
-        return list(pairs)
-    keys = set(range(0, count, -(-count // KEYS)))
-    return [(a, b) for a, b in pairs if b - a <= NEIGHBOURS or (a in keys and b in keys)]
+def read_descriptors(database: Path) -> dict[str, torch.Tensor]:
+    """The descriptors (n, 128) uint8 of the images in COLMAP's database, by file."""
+    with pycolmap.Database.open(database) as opened:
+        images = opened.read_all_images()
+        return {i.name: torch.tensor(opened.read_descriptors(i.image_id).data).reshape(-1, 128) for i in images}
+
+
+def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The most similar one of the `others` (m, 128) to each descriptor (n, 128): indices (n,), and is it a match (n,)?
+
+    A match must pass the ratio test. Products of integers are exact in float32.
+    """
+    others = torch.cat([others.float(), torch.zeros(1, others.shape[1])])  # the second nearest one if there is only one
+    buffer, found = torch.empty(BLOCK, len(others)), []  # new memory for each block would take longer than its product
+    for block in descriptors.split(BLOCK):
+        products = torch.mm(block.float(), others.T, out=buffer[: len(block)])
+        first, index = products.max(1)
+        found.append((index, first, products.scatter_(1, index[:, None], 0).amax(1)))
+    index, *cosines = map(torch.cat, zip(*found))
+    first, second = (torch.acos((cosine.double() / LENGTH**2).clamp(max=1)) for cosine in cosines)
+    return index, (first <= ANGLE) & (first < RATIO * second)
+
+
+def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
+    """Matches (k, 2) uint32 between descriptors (n, 128) and (m, 128): those that are nearest to each other."""
+    there, passed = nearest(first, second)
+    rows = passed.nonzero()[:, 0]
+    back, passed = nearest(second[there[rows]], first)
+    rows = rows[passed & (back == rows)]
+    return torch.stack([rows, there[rows]], 1).numpy().astype(np.uint32)
+
+
+def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]:
+    """The pairs of photographs that are matched. `descriptors` (n, 128) of each, sorted by name.
+
+    Of many photographs only those that are similar or neighbours. Photographs are similar if they show the same words
+    (Sivic and Zisserman, "Video Google", 2003). The words are descriptors that are drawn from all photographs.
+    """
+    pairs = list(itertools.combinations(range(len(descriptors)), 2))
+    if len(descriptors) <= ALL_PAIRS:
+        return pairs
+    everything = torch.cat(list(descriptors))
+    words = everything[torch.randperm(len(everything), generator=torch.Generator().manual_seed(0))[:WORDS]]
+    counts = torch.stack(in_parallel(partial(count_words, words=words), descriptors))
+    rarity = torch.log(len(counts) / (counts > 0).sum(0).clamp(min=1))
+    weights = torch.nn.functional.normalize(counts.sqrt() * rarity)
+    similarity = (weights @ weights.T).fill_diagonal_(-1)
+    chosen = torch.zeros(len(counts), len(counts), dtype=torch.bool)
+    chosen.scatter_(1, similarity.topk(SIMILAR).indices, True)
+    return [(a, b) for a, b in pairs if b - a <= NEIGHBOURS or chosen[a, b] or chosen[b, a]]
+
+
+def count_words(descriptors: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
+    """The number of descriptors (n, 128) that each of the words (m, 128) is the most similar one to: (m + 1,)."""
+    return torch.bincount(nearest(descriptors, words)[0], minlength=len(words) + 1)
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
     """Match the pairs that the database lacks. Raises InputError if the first batch is from one viewpoint."""
-    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
+    descriptors = read_descriptors(folder / "database.db")
+    files = [grey_file(picture) for picture in pictures]
+    pairs = [(files[a], files[b]) for a, b in pairs_to_match([descriptors[file] for file in files])]
+    for number, _ in enumerate(progress(match_pairs(pairs, descriptors, folder), "matching", len(pairs)), 1):
+        if number == min(BATCH, len(pairs)):
+            share = static_share(folder / "database.db", pairs[:number])
+            if share >= MAX_STATIC:
+                raise InputError(f"{pictures[0].path.parent}: photographs: {share:.0%} of the first {number} pairs are "
+                                 "from one place; walk around the object, 10 degrees at a time")  # fmt: skip
+
+
+def match_pairs(
+    pairs: Sequence[tuple[str, str]], descriptors: Mapping[str, torch.Tensor], folder: Path
+) -> Iterator[tuple[str, str]]:
+    """The pairs of files as soon as the database has their verified matches. Existing ones are kept."""
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0  # otherwise it depends on the thread
-    pairs = pairs_to_match(len(pictures))
-    batches = [pairs[k : k + BATCH] for k in range(0, len(pairs), BATCH)]
     database, listed = folder / "database.db", folder / "pairs.txt"
-    for batch in progress(batches, "matching"):
-        named = [(grey_file(pictures[a]), grey_file(pictures[b])) for a, b in batch]
-        listed.write_text("".join(f"{a} {b}\n" for a, b in named), "utf-8")
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
-        interruptible(pycolmap.match_image_pairs, database, matching, pairing, verification)
-        if batch is batches[0] and (share := static_share(database, named)) >= MAX_STATIC:
-            raise InputError(f"{pictures[0].path.parent}: photographs: {share:.0%} of the first {len(batch)} pairs are "
-                             "from one place; walk around the object, 10 degrees at a time")  # fmt: skip
+    for batch in batches(pairs, BATCH):
+        with pycolmap.Database.open(database) as opened:
+            ids = {file: opened.read_image_with_name(file).image_id for pair in batch for file in pair}
+            if new := [pair for pair in batch if not opened.exists_matches(ids[pair[0]], ids[pair[1]])]:
+                found = in_parallel(match_descriptors, *([descriptors[file] for file in files] for files in zip(*new)))
+                for (a, b), matches in zip(new, found):
+                    opened.write_matches(ids[a], ids[b], matches)
+        listed.write_text("".join(f"{a} {b}\n" for a, b in batch), "utf-8")
+        interruptible(pycolmap.verify_matches, database, listed, verification)
+        yield from batch
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:

@@ -14,7 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.formats import detect
-from mi_ring.importers.frames import frames_of, require_cameras
+from mi_ring.importers.frames import adapt, frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, reduction
 from mi_ring.photogrammetry.flash_light import FlashCalibration, ObjectSphere, calibrate_flash
@@ -32,7 +32,7 @@ from mi_ring.system.progress import Progress
 
 MIN_DEGREES = 15.0  #: between the directions of two of the photographs
 MIN_DETECTIONS = 3  #: photographs that must show the sheet
-FORMAT = 2  #: version of the saved results; increase it when they change
+FORMAT = 3  #: version of the saved results; increase it when they change
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
@@ -121,8 +121,12 @@ def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
         source = replace(source, exif=False)
     imported = frames_of(source)
     require_cameras(imported)
+    for note in source.notes:
+        print(note)
     frames = {frame.image.stem: frame for frame in imported}
     for p in pictures:
+        if p.name in frames:
+            adapt(frames[p.name], p.size, 1)
         if p.name in frames and frames[p.name].lens.size != p.size:
             raise InputError("{}: has a camera of {} x {} pixels for {}, which has {} x {}; was it turned?".format(
                 source.src, *frames[p.name].lens.size, p.path.name, *p.size))  # fmt: skip
@@ -207,7 +211,7 @@ def flash_from_sheet(
     poses = {name: pose for name, (_, pose) in sparse.cameras.items()}
     placed = [picture for picture in pictures if picture.name in poses]
     exposures = dict(zip((picture.name for picture in placed), relative_exposures(placed, np.nan)))
-    curved = all(picture.encoding != "linear" for picture in placed)  # raw files are linear
+    curved = all(not picture.raw for picture in placed)  # raw files are linear
     axes = turn_with_cameras(pictures, np.eye(3))
     return calibrate_flash(sheet.papers, poses, axes, exposures, offset, sphere, curved)
 

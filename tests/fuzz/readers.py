@@ -33,7 +33,7 @@ from mi_ring.importers.llff import Llff
 from mi_ring.importers.metashape import Metashape
 from mi_ring.importers.middlebury import Middlebury
 from mi_ring.importers.neus import Neus
-from mi_ring.importers.photogrammetry import exif_exposure
+from mi_ring.importers.photogrammetry import exif_values
 from mi_ring.importers.reading import has_alpha, image_size, pixels_of
 from mi_ring.importers.realitycapture import RealityCapture
 from mi_ring.importers.sfmdata import SfmData
@@ -205,7 +205,7 @@ def picture(name: str, write: Callable[[Path], object]) -> Callable[[Path], Read
         write(path)
 
         def read() -> None:
-            for ask in (image_size, has_alpha, exif_exposure, pixels_of):
+            for ask in (image_size, has_alpha, exif_values, pixels_of):
                 documented(lambda ask=ask: ask(path))
             one = Picture(path)
             for ask in ("exif", "exposure", "camera_orientation", "size", "pixels"):

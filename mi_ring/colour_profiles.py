@@ -1,0 +1,94 @@
+"""What image files say about their colours: ICC profiles, chunks of PNG, primaries of OpenEXR."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import imagecodecs
+import numpy as np
+
+SPACES = {b"RGB ": "rgb", b"GRAY": "gray"}  #: colour spaces of profiles, and their names in imagecodecs
+WHITE, PRIMARIES = (0.3127, 0.3290), (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)  #: of sRGB: x, y of CIE
+RELATIVE = 1  #: rendering intent: relative colorimetric
+
+
+class Statement(NamedTuple):
+    """What a file says about its colours. Without either, 8 bits are sRGB, and all others are linear."""
+
+    profile: bytes | None = None  #: an ICC profile
+    exponent: float | None = None  #: linear = encoded ^ exponent; 2.2 stands for sRGB's curve
+
+
+def primaries_profile(white: tuple, primaries: tuple) -> bytes:
+    """The profile of linear RGB with this white (x, y) and these primaries (x, y of red, green and blue)."""
+    places = [value for k in range(3) for value in (*primaries[2 * k : 2 * k + 2], 1.0)]
+    return imagecodecs.cms_profile("rgb", whitepoint=(*white, 1.0), primaries=tuple(places), gamma=1.0)
+
+
+@lru_cache(maxsize=8)
+def is_usual(profile: bytes, linear: bool) -> bool:
+    """Is a profile that of sRGB, or with `linear` that of linear radiance with sRGB's primaries?"""
+    if profile[16:20] == b"GRAY" and linear:
+        colours = np.linspace(0, 1, 64, dtype=np.float32)[:, None, None]
+    else:
+        axis = np.linspace(0, 1, 6, dtype=np.float32)
+        colours = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(36, 6, 3)
+    expected = colours if linear else np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    return bool(np.abs(transformed(colours, profile) - expected).max() < 2e-3)
+
+
+def transformed(colours: np.ndarray, profile: bytes) -> np.ndarray:
+    """Linear radiance, sRGB's primaries, of encoded colours (H, W, 1 or 3): uint16 for integers, otherwise float32.
+
+    Raises ValueError if the profile is damaged, or neither of RGB nor of grey.
+    """
+    if (space := SPACES.get(profile[16:20])) is None:
+        raise ValueError(f"its colour profile is of {profile[16:20].decode('ascii', 'replace').strip()}, not of RGB or "
+                         "grey; save it as sRGB")  # fmt: skip
+    count = colours.shape[2]
+    data = np.repeat(colours, 3, 2) if space == "rgb" and count == 1 else colours
+    kind = np.float32 if colours.dtype == np.float32 else np.uint16
+    target = primaries_profile(WHITE, PRIMARIES)
+
+    def convert(pixels: np.ndarray) -> np.ndarray:
+        try:
+            return imagecodecs.cms_transform(np.ascontiguousarray(pixels), profile, target, colorspace=space,
+                                             outcolorspace="rgb", outdtype=kind, intent=RELATIVE)  # fmt: skip
+        except imagecodecs.CmsError as error:
+            raise ValueError(f"its colour profile cannot be used ({error}); save it as sRGB") from error
+
+    if space == "gray":
+        return np.stack([convert(data[..., c])[..., 1] for c in range(count)], -1)
+    return convert(data)[..., :count] if count > 1 else convert(data)[..., 1:2]
+
+
+def as_stated(pixels: np.ndarray, said: Statement) -> np.ndarray:
+    """Pixels (H, W, C) of a file, of which 8 bits are sRGB, and all others linear radiance with sRGB's primaries.
+
+    Those that are stored so are returned as they are. Others become linear: uint16 if they were integers, otherwise
+    float32. A clipped pixel remains clipped. Raises ValueError as `transformed` does.
+    """
+    kind = pixels.dtype
+    count = 3 if pixels.shape[2] > 2 else 1
+    colours = pixels[..., :count]
+    full = 1.0 if kind == np.float32 else np.iinfo(kind).max
+    if said.profile:
+        if is_usual(said.profile, kind != np.uint8):
+            return pixels
+        linear = transformed(colours, said.profile)
+    elif said.exponent and (abs(said.exponent - 2.2) < 0.05) != (kind == np.uint8) and not (
+        said.exponent == 1 and kind != np.uint8
+    ):  # fmt: skip
+        value = colours if kind == np.float32 else np.arange(full + 1, dtype=np.float32) / np.float32(full)
+        if abs(said.exponent - 2.2) < 0.05:
+            value = np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4)
+        else:
+            value = np.maximum(value, 0) ** np.float32(said.exponent)
+        linear = value if kind == np.float32 else (value * 65535 + 0.5).astype(np.uint16)[colours]
+    else:
+        return pixels
+    if linear.dtype == np.uint16:
+        linear[colours == full] = 65535
+        alpha = pixels[..., count:].astype(np.uint16) * np.uint16(65535 // full)
+    else:
+        alpha = pixels[..., count:]
+    return np.concatenate([linear, alpha.astype(linear.dtype)], -1)

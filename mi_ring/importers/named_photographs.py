@@ -1,0 +1,135 @@
+"""What formats have in common that name the file of each photograph."""
+
+from collections.abc import Iterable, Iterator, Sequence, Sized
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from mi_ring.errors import InputError, is_file
+from mi_ring.importers.frames import Frame, Source
+from mi_ring.importers.photograph_files import MASKS, PhotographFiles, name_of, refuse_twins
+from mi_ring.importers.reading import has_alpha, images_below
+
+
+@dataclass(frozen=True)
+class NamedPhotographs(Source):
+    """Base of the formats that name the file of each photograph. Each format implements `posed`."""
+
+    images: Path | None = None
+    """Folder of the photographs. Without it: where the file says, or the nearest folder `images` beside or above SRC.
+    A photograph is found by its name and as many of its folders as are needed."""
+    masks: Path | None = None
+    """Folder of masks: photo.jpg has the mask photo.jpg.png, photo.png or photo.jpg.
+    Without it: the masks that the file names, alpha channels, or a folder `masks` beside the photographs."""
+
+    def posed(self) -> Iterator[Frame]:
+        """The photographs with a pose. Their field `said` is the path that was given to `photograph`."""
+        raise NotImplementedError
+
+    @property
+    def beside(self) -> Path:
+        """The folder of SRC, or SRC itself if it is a folder."""
+        return self.src if self.src.is_dir() else self.src.parent
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the photographs, unless the format has a rule of its own."""
+        candidates = (self.beside / "images", self.beside.parent / "images")
+        return self.images or next((folder for folder in candidates if folder.is_dir()), self.beside)
+
+    @cached_property
+    def photograph_files(self) -> PhotographFiles:
+        """The files that may be photographs: `photographs`, or those in `folder`."""
+        if self.photographs is not None:
+            return PhotographFiles(self.photographs, self.photographs[0].parent if self.photographs else Path())
+        return PhotographFiles(images_below(self.folder), self.folder)
+
+    @property
+    def available(self) -> Sequence[Path]:
+        return self.photograph_files.ordinary
+
+    def photograph(self, path: str, what: str, relative: bool = False) -> Path | None:
+        """The photograph at a path that the file says; None if there is none. It is then in `without_photograph`.
+
+        `relative`: is the path relative to the folder of SRC? Raises InputError, which begins with `what`, if the path
+        may be that of several photographs.
+        """
+        if relative and self.photographs is None and self.images is None and is_file(file := self.beside / path):
+            return file
+        try:
+            found = self.photograph_files.find(path)[0]
+        except InputError as error:
+            raise InputError(f"{what}: {error}") from error
+        if found is None:
+            self.without_photograph.append(path)
+        return found
+
+    def mask_at(self, path: str, what: str) -> Path:
+        """The mask at a path that the file says. Raises InputError, which begins with `what`, if there is none."""
+        if is_file(file := self.beside / path):
+            return file
+        folder = self.masks or self.beside
+        if found := PhotographFiles(images_below(folder), folder).find(path)[0]:
+            return found
+        raise InputError(f"{what}: no mask {path!r} in {folder}; give --masks, its folder, or take it out of the file")
+
+    def frames(self) -> Iterator[Frame]:
+        frames = list(self.posed())
+        files = self.photograph_files
+        known = {*files.files}
+        claims = [(f.image, f.said, f.image not in known or files.find(f.said)[1]) for f in frames]
+        lost = refuse_twins(claims)
+        self.without_photograph.extend(frame.said for frame in frames if frame.said in lost)
+        frames = [frame for frame in frames if frame.said not in lost]
+        if self.photographs is None:
+            self.find_masks(frames)
+        yield from frames
+
+    def find_masks(self, frames: list[Frame]) -> None:
+        """Give the frames their masks: from `masks`, otherwise alpha channels, or a folder of masks beside them."""
+        folder = self.masks
+        if folder is not None and not folder.is_dir():
+            raise InputError(f"{folder}: --masks: no such folder")
+        if folder is None:
+            for frame in frames:
+                if frame.mask is None and has_alpha(frame.image):
+                    frame.mask = frame.image
+            if all(frame.mask for frame in frames):
+                return
+            root = self.photograph_files.root
+            places = dict.fromkeys(place / name for place in (root.parent, root) for name in MASKS)
+            folder = next((place for place in places if place.is_dir() and place != root), None)
+        if folder is None:
+            return
+        masks = PhotographFiles(images_below(folder), folder)
+        for frame in frames:
+            if frame.mask is not None and self.masks is None:
+                continue
+            image = frame.image
+            inside = image.is_relative_to(self.photograph_files.root)
+            said = image.relative_to(self.photograph_files.root).as_posix() if inside else image.name
+            frame.mask = masks.find(said)[0]
+            if frame.mask is None and self.masks is not None:
+                raise InputError(f"{folder}: --masks: has no mask of {image.name}, such as {image.name}.png or "
+                                 f"{image.stem}.png; give all, or leave the photograph out")  # fmt: skip
+        used = {frame.mask for frame in frames}
+        if self.masks is None and not used & {*masks.files} and masks.files:
+            self.notes.append(f"{folder}: none of its {len(masks.files)} images is named after a photograph; not used "
+                              f"as masks")  # fmt: skip
+            return
+        without = [frame.image.name for frame in frames if frame.mask is None]
+        if without:
+            self.notes.append(f"{counted(without, 'photograph')} without a mask in {folder}: {few(without)}")
+        if unused := [file.name for file in masks.files if file not in used]:
+            self.notes.append(f"{counted(unused, 'mask')} in {folder} of no photograph: {few(unused)}")
+
+
+def counted(things: Sized, word: str) -> str:
+    """The number of things, with the word for one."""
+    return f"{len(things)} {word}{'s' * (len(things) != 1)}"
+
+
+def few(names: Iterable[str]) -> str:
+    """The first three names, sorted, without their folders."""
+    some = sorted({" ".join(name_of(name).split())[:99] for name in names})
+    return ", ".join(some[:3]) + (", …" if len(some) > 3 else "")

@@ -1,0 +1,110 @@
+"""Finds photographs and masks by the paths that files of other tools say."""
+
+import re
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from mi_ring.errors import InputError
+
+#: What follows the last dot of a name and is a suffix. "IMG.1" and "IMG.2" differ in more than their suffix.
+SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,4}$")
+MASKS = ("masks", "mask", "segmentation", "segmentations")  #: folders of masks, in lower case
+#: Folders, in lower case, whose images are no photographs, unless a path names them.
+ASIDE = {*MASKS, "depth", "depths", "normal", "normals", "valid", "sparse"}
+
+
+def parts_of(path: str) -> list[str]:
+    """The folders and the file name in a path of any system, in lower case, without drive, `.` and `..`."""
+    parts = re.split(r"[/\\]+", unicodedata.normalize("NFC", path).casefold())
+    return [part for part in parts if part not in ("", ".", "..") and not re.fullmatch("[a-z]:", part)]
+
+
+def name_of(path: str) -> str:
+    """The file name in a path of any system."""
+    return re.split(r"[/\\]+", path)[-1]
+
+
+def stem_of(name: str) -> str:
+    """A name, in lower case, without its suffix."""
+    return SUFFIX.sub("", name)
+
+
+class PhotographFiles:
+    """Image files, found by the paths that another tool says.
+
+    Case, suffix, drive and the folders of another computer may differ. Of files with the same name, the one is found
+    whose folders agree with the path.
+    """
+
+    def __init__(self, files: Iterable[Path], root: Path) -> None:
+        self.files, self.root = list(files), root
+        self.folders = {file: parts_of(file.parent.as_posix()) for file in self.files}
+        self.below = len(parts_of(root.as_posix()))  #: number of folders that all files share
+        self.by_name: dict[str, list[Path]] = defaultdict(list)
+        for file in self.files:
+            name = parts_of(file.name)[0]
+            for key in {name, stem_of(name)}:
+                self.by_name[key].append(file)
+
+    @property
+    def ordinary(self) -> list[Path]:
+        """The files that are no masks, depth maps or the like, by the names of their folders."""
+        return [file for file in self.files if not ASIDE.intersection(self.folders[file][self.below :])]
+
+    def find(self, path: str) -> tuple[Path | None, bool]:
+        """The file at a path, and whether its folders below `root` agree with those of the path; None if there is none.
+
+        Raises InputError if the path may be that of several files.
+        """
+        if not (parts := parts_of(path)):
+            return None, False
+        *folders, name = parts
+        candidates = dict.fromkeys([*self.by_name.get(name, ()), *self.by_name.get(stem_of(name), ())])
+        if self.root != Path() and (own := self.root / path) in candidates:
+            return own, True
+        aside = ASIDE - {*folders}
+        ranks: dict[Path, tuple] = {}
+        for file in candidates:
+            own_folders = self.folders[file]
+            if aside.intersection(own_folders[self.below :]):
+                continue
+            agree = next((k for k, (a, b) in enumerate(zip(reversed(own_folders), reversed(folders))) if a != b),
+                         min(len(own_folders), len(folders)))  # fmt: skip
+            more = max(0, len(own_folders) - self.below - agree)  # folders below the root that the path does not say
+            own_name = parts_of(file.name)[0]
+            unlike = [file.name != name_of(path), own_name != name, stem_of(own_name) != name]
+            ranks[file] = (bool(more and len(folders) > agree), -agree, more, [*unlike[:2], all(unlike[1:])])
+        if not ranks:
+            return None, False
+        best = min(ranks.values())
+        found = [file for file, rank in ranks.items() if rank == best]
+        contrary = best[0]
+        if contrary and len({file.parent for file in ranks}) > 1:  # of several folders, none is the one that is said
+            return None, False
+        if len(found) > 1:
+            raise InputError(f"{path!r} may be {' or '.join(map(str, found[:3]))}; keep one, or give --images, the "
+                             "folder that the paths begin in")  # fmt: skip
+        return found[0], not contrary
+
+
+def refuse_twins(claims: Sequence[tuple[Path, str, bool]]) -> set[str]:
+    """The paths whose file belongs to another path, for files that were found for several paths.
+
+    `claims`: file, path, and whether the folders of both agree. Raises InputError if two paths have equal right to a
+    file.
+    """
+    by_file: dict[Path, list[tuple[str, bool]]] = defaultdict(list)
+    for file, path, agrees in claims:
+        by_file[file].append((path, agrees))
+    lost = set()
+    for file, paths in by_file.items():
+        if len(paths) < 2:
+            continue
+        first = [path for path, agrees in paths if agrees] or [path for path, _ in paths]
+        if len(first) > 1:
+            raise InputError(f"{file}: would be the photograph of two cameras, {first[0]!r} and {first[1]!r}; give "
+                             "--images, the folder that the paths of the cameras begin in")  # fmt: skip
+        lost |= {path for path, _ in paths} - {*first}
+    return lost

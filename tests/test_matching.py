@@ -1,0 +1,189 @@
+"""Features and matches of photographs: what the products find, which pairs are matched, what a second run keeps."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mi_ring.errors import InputError
+from mi_ring.photogrammetry import matching
+from mi_ring.photogrammetry.folder import Picture, find_pictures
+
+
+def silent(things, *_):
+    return things
+
+
+def normalised(random, *shape):
+    """Descriptors (n, 128) as SIFT writes them."""
+    values = random.uniform(0, 1, (*shape, 128)) ** 4
+    return np.rint(512 * values / np.linalg.norm(values, axis=-1, keepdims=True)).clip(0, 255).astype(np.uint8)
+
+
+def by_brute_force(first, second):
+    """Matches by the definition, one descriptor at a time."""
+
+    def best(own, others):
+        angles = [np.arccos(min(1.0, int(own.astype(int) @ other.astype(int)) / 512**2)) for other in others]
+        order = np.argsort(angles)
+        rival = angles[order[1]] if len(angles) > 1 else np.pi / 2
+        return order[0] if angles[order[0]] <= 0.7 and angles[order[0]] < 0.8 * rival else None
+
+    there = [best(own, second) if len(second) else None for own in first]
+    back = [best(own, first) if len(first) else None for own in second]
+    return [(k, match) for k, match in enumerate(there) if match is not None and back[match] == k]
+
+
+@pytest.mark.parametrize("sizes", [(0, 0), (0, 5), (5, 0), (1, 1), (1, 40), (40, 1), (130, 97)], ids=str)
+def test_matches_are_those_of_brute_force(sizes, monkeypatch):
+    """In blocks that the features do not fill; with twins, whose match is ambiguous, and with pairs at the limits."""
+    monkeypatch.setattr(matching, "BLOCK", 32)
+    random = np.random.default_rng(4)
+    first, second = (normalised(random, n) for n in sizes)
+    shared = min(sizes) // 2 + min(sizes) % 2
+    noise = random.normal(0, np.linspace(0, 30, max(shared, 1))[:shared, None], (shared, 128))
+    second[-shared or len(second) :] = np.rint(first[:shared] + noise).clip(0, 255)
+    if sizes == (130, 97):
+        first[100], second[3], first[101:104] = first[1], second[-3], first[4]  # ties in either photograph
+        first[5] = second[-10] = 0  # no direction at all
+    expected = by_brute_force(first, second)
+    assert len(expected) >= shared / 3 and (len(expected) < shared or shared < 2)
+    found = matching.match_descriptors(torch.tensor(first), torch.tensor(second))
+    assert found.dtype == np.uint32 and found.tolist() == [list(map(int, pair)) for pair in expected]
+
+
+def test_all_pairs_of_few_photographs_are_matched():
+    few = [torch.zeros(k % 3, 128, dtype=torch.uint8) for k in range(matching.ALL_PAIRS)]
+    assert matching.pairs_to_match(few) == list(itertools.combinations(range(len(few)), 2))
+    assert len(matching.pairs_to_match([*few, *few])) < 120 * 119 / 2  # photographs may have no features
+
+
+def test_of_a_ring_of_many_photographs_all_neighbours_are_matched():
+    """In any order of names: each sees a part of the ring, other things, and nothing twice the same."""
+    random, count, reach = np.random.default_rng(1), 100, 10
+    landmarks, views = normalised(random, 2000), []
+    place = random.permutation(count)
+    for angle in place:
+        seen = np.arange(angle * 20, (angle + reach) * 20) % len(landmarks)  # the next one shows 90 % of the same
+        seen = random.choice(seen, 150, replace=False)
+        noisy = np.rint(landmarks[seen] + random.normal(0, 8, (len(seen), 128))).clip(0, 255).astype(np.uint8)
+        views.append(torch.tensor(np.concatenate([noisy, normalised(random, 50)])))
+    pairs = matching.pairs_to_match(views)
+    apart = np.abs(place[:, None] - place)
+    apart = np.minimum(apart, count - apart)
+    near = {(a, b) for a, b in itertools.combinations(range(count), 2) if apart[a, b] <= reach // 2}
+    assert near <= set(pairs) and len(pairs) < 3000 and pairs == sorted(set(pairs))
+    assert {(k, k + 1) for k in range(count - 1)} <= set(pairs)
+    assert pairs == matching.pairs_to_match(views)  # so that an interrupted run goes on with the same
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Photographs of a plane with blots, each turned and moved, one of another size, one without any feature."""
+    pytest.importorskip("pycolmap").logging.minloglevel = 2
+    monkeypatch.setattr(matching, "FEATURES", 500)
+    random = np.random.default_rng(0)
+    layers = [cv2.GaussianBlur(random.normal(size=(500, 500)), (0, 0), sigma) * sigma for sigma in (1.5, 4, 10)]
+    page = np.where(sum(layers) > 0, 200, 30).astype(np.uint8)
+    for k in range(8):
+        size = np.array([160, 120] if k < 6 else [120, 160])
+        turn = cv2.getRotationMatrix2D((250, 250), 9 * k, 0.6 + 0.02 * k)
+        turn[:, 2] += size / 2 - 250
+        image = cv2.warpAffine(page, turn, tuple(size)) if k != 3 else np.full(size[::-1], 9, np.uint8)
+        cv2.imwrite(f"{tmp_path}/a photograph {k}.png", image)
+    (tmp_path / "work/grey").mkdir(parents=True)
+    return tmp_path
+
+
+def content(database):
+    """Cameras by files, matches by pairs of files, and the number of verified ones of each pair that was verified."""
+    with matching.pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        pairs = {frozenset((names[a], names[b])): (a, b) for a, b in itertools.combinations(names, 2)}
+        matches = {pair: opened.read_matches(*ids).tolist() for pair, ids in pairs.items()
+                   if opened.exists_matches(*ids)}  # fmt: skip
+        verified = {pair: len(opened.read_two_view_geometry(*ids).inlier_matches) for pair, ids in pairs.items()
+                    if opened.exists_two_view_geometry(*ids)}  # fmt: skip
+    return matching.camera_ids(database), matches, verified
+
+
+def test_photographs_that_show_the_same_match(folder, monkeypatch):
+    pictures, shown = find_pictures(folder), []
+    monkeypatch.setattr(matching, "BATCH", 10)
+
+    def progress(things, what, total):
+        shown.append((what, total))
+        return things
+
+    matching.find_features(pictures, folder / "work", progress)
+    matching.match_features(pictures, folder / "work", progress)
+    assert shown == [("features", 8), ("pairs", 28)]
+    cameras, matches, verified = content(folder / "work/database.db")
+    assert len(matches) == len(verified) == 28
+    blank = matching.grey_file(pictures[3])
+    assert all((n == 0) == (blank in pair) for pair, n in verified.items())
+    assert min(n for pair, n in verified.items() if blank not in pair) > 40
+    files = [matching.grey_file(picture) for picture in pictures]
+    assert len({cameras[file] for file in files[:6]}) == len({cameras[file] for file in files[6:]}) == 1
+    assert cameras[files[0]] != cameras[files[6]]
+
+
+def test_what_an_earlier_run_has_found_is_kept(folder, monkeypatch):
+    """Features of one batch, matches of COLMAP's own matcher, matches that were not verified yet."""
+    pictures, work = find_pictures(folder), folder / "work"
+    database, pycolmap = work / "database.db", matching.pycolmap
+    matching.find_features(pictures[:5], work, silent)
+    files = [matching.grey_file(picture) for picture in pictures]
+    (work / "pairs.txt").write_text(f"{files[0]} {files[1]}\n{files[1]} {files[2]}\n")
+    options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
+    pycolmap.match_image_pairs(database, options, pycolmap.ImportedPairingOptions(match_list_path=work / "pairs.txt"))
+    with pycolmap.Database.open(database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        before = content(database)
+        some = opened.read_matches(ids[files[0]], ids[files[1]])[:3]
+        opened.write_matches(ids[files[0]], ids[files[2]], some)
+    decoded = []
+    grey = Picture.grey
+    monkeypatch.setattr(Picture, "grey", lambda self, longest: decoded.append(self.name) or grey(self, longest))
+    matching.find_features(pictures, work, silent)
+    assert sorted(decoded) == [picture.name for picture in pictures[5:]]
+    matching.match_features(pictures, work, silent)
+    cameras, matches, verified = content(database)
+    assert before[0].items() <= cameras.items() and cameras[files[5]] == cameras[files[0]]
+    assert before[1].items() <= matches.items() and before[2].items() <= verified.items()
+    assert len(verified) == 28 and verified[frozenset((files[0], files[2]))] == 0  # verified now
+    monkeypatch.setattr(matching, "match_descriptors", None)  # nothing is left to do
+    matching.match_features(pictures, work, silent)
+    assert content(database) == (cameras, matches, verified)
+
+
+def test_an_interrupted_run_loses_at_most_a_batch(folder, monkeypatch):
+    pictures, work = find_pictures(folder), folder / "work"
+    matching.find_features(pictures, work, silent)
+    calls, match = [], matching.match_descriptors
+
+    def interrupted(*descriptors):
+        calls.append(1)
+        if len(calls) == 12:
+            raise KeyboardInterrupt
+        return match(*descriptors)
+
+    monkeypatch.setattr(matching, "BATCH", 4)
+    monkeypatch.setattr(matching, "in_parallel", lambda *arguments: list(map(*arguments)))
+    monkeypatch.setattr(matching, "match_descriptors", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        matching.match_features(pictures, work, silent)
+    matching.match_features(pictures, work, silent)
+    assert len(calls) == 28 + 4 and len(content(work / "database.db")[2]) == 28
+
+
+def test_photographs_from_one_place_are_refused(folder):
+    page = cv2.imread(f"{folder}/a photograph 0.png")
+    for k in range(8):
+        cv2.imwrite(f"{folder}/a photograph {k}.png", np.roll(page, k, 1))
+    pictures = find_pictures(folder)
+    matching.find_features(pictures, folder / "work", silent)
+    with pytest.raises(InputError, match="100% of the first 28 pairs are from one place"):
+        matching.match_features(pictures, folder / "work", silent)

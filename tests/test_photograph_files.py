@@ -1,0 +1,289 @@
+"""Which file is the photograph of which camera, and what is said of those that are left over."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.foreign_captures import K, cameras, colmap_folder, converted, noise, transforms, write
+from helpers.photogrammetry_files import NAMES, POINTS, SIZE, alicevision, csv_table, metashape, middlebury, openmvg
+from PIL import Image
+
+from mi_ring import convert
+from mi_ring.errors import InputError
+from mi_ring.importers.frames import adapt_all, frames_of, require_frames
+from mi_ring.importers.metashape import Metashape
+from mi_ring.importers.middlebury import Middlebury
+from mi_ring.importers.photograph_files import PhotographFiles, refuse_twins
+from mi_ring.importers.realitycapture import RealityCapture
+from mi_ring.importers.sfmdata import SfmData
+from mi_ring.importers.transforms import Transforms
+
+
+def files(*names, root="/data/photos"):
+    return PhotographFiles([Path(root, name) for name in names], Path(root))
+
+
+@pytest.mark.parametrize(("path", "found"), [
+    ("n-s/1.JPG", "n-s/1.JPG"), ("e-w/1.JPG", "e-w/1.JPG"), (r"D:\drone\e-w\1.JPG", "e-w/1.JPG"),
+    ("/home/else/e-w/1.jpg", "e-w/1.JPG"), ("./N-S/1", "n-s/1.JPG"), ("../photos/n-s/1.tif", "n-s/1.JPG"),
+    ("2.jpg", "2.png"), ("gone/2.jpg", "2.png"), ("C:2.png", None), ("photos/2", "2.png"), ("3.png", None),
+    ("IMG.2", "IMG.2.jpg"), ("IMG.9", None), ("", None), ("/", None), ("e-w", None),
+    ("Cafe\u0301.png", "caf\xe9.png"), ("masks/5.png", "masks/5.png"), ("5.png", None), ("other/1.JPG", None),
+])  # fmt: skip
+def test_a_photograph_is_found_by_its_name_and_as_many_folders_as_are_needed(path, found):
+    folder = files("n-s/1.JPG", "e-w/1.JPG", "2.png", "IMG.2.jpg", "IMG.3.jpg", "caf\xe9.png", "masks/5.png")
+    file, _ = folder.find(path)
+    assert file == (found and Path("/data/photos", found))
+
+
+@pytest.mark.parametrize(("path", "names"), [
+    ("1.jpg", ["a/1.jpg", "b/1.jpg"]), ("1", ["1.jpg", "1.png"]), ("1.tif", ["1.jpg", "1.png"]),
+    ("x/1.jpg", ["a/x/1.jpg", "b/x/1.jpg"]),
+])  # fmt: skip
+def test_nothing_is_matched_by_luck(path, names):
+    with pytest.raises(InputError, match=r"may be .*1.jpg or .*; keep one, or give --images"):
+        files(*names).find(path)
+
+
+def test_two_cameras_with_one_photograph_are_refused_unless_one_names_another_folder():
+    with pytest.raises(InputError, match="1.jpg: would be the photograph of two cameras, 'a' and 'b'; give --images"):
+        refuse_twins([(Path("1.jpg"), "a", True), (Path("1.jpg"), "b", True)])
+    assert refuse_twins([(Path("1.jpg"), "x/1.jpg", True), (Path("1.jpg"), "y/1.jpg", False)]) == {"y/1.jpg"}
+
+
+def in_folders(folder, wrap=lambda name: name):
+    """Photographs of equal names in folders below `images`: pairs of new name and old name."""
+    new = ["e-w/1.JPG", "n-s/1.JPG", "n-s/2.jpeg"]
+    moved = {}
+    for path, name in zip(new, NAMES):
+        (folder / "images" / path).parent.mkdir(parents=True, exist_ok=True)
+        old = next(file for file in (folder / "images" / name, folder / name) if file.exists())
+        old.rename(folder / "images" / path)
+        moved[name] = wrap(path)
+    return moved
+
+
+def replaced(path, pairs):
+    text = path.read_text()
+    for old, new in pairs.items():
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+
+
+def metashape_in_folders(folder):
+    path = metashape(folder)
+    replaced(path, {f"label='{n.split('.')[0]}'": f"label='{p}'" for n, p in in_folders(folder).items()})
+    return Metashape(path, Path())
+
+
+def meshroom_in_folders(folder):
+    path = alicevision(folder)
+    replaced(path, in_folders(folder, lambda name: name.replace("/", "\\\\")))
+    return SfmData(path, Path())
+
+
+def openmvg_in_folders(folder):
+    path = openmvg(folder)
+    replaced(path, in_folders(folder))
+    return SfmData(path, Path())
+
+
+def table_in_folders(folder):
+    path = csv_table(folder)
+    replaced(path, in_folders(folder, lambda name: f"E:\\job\\{name}".replace("/", "\\")))
+    return RealityCapture(path, Path())
+
+
+def middlebury_in_folders(folder):
+    middlebury(folder)
+    replaced(folder / "pot_par.txt", in_folders(folder))
+    return Middlebury(folder, Path())
+
+
+@pytest.mark.parametrize("make", [
+    metashape_in_folders, meshroom_in_folders, openmvg_in_folders, table_in_folders, middlebury_in_folders,
+])  # fmt: skip
+def test_photographs_of_equal_names_in_several_folders(tmp_path, make):
+    source = make(tmp_path)
+    frames = frames_of(source)
+    assert [frame.image.relative_to(tmp_path / "images").as_posix() for frame in frames] == [
+        "e-w/1.JPG", "n-s/1.JPG", "n-s/2.jpeg"]  # fmt: skip
+    assert not source.without_photograph
+    object.__setattr__(source, "images", tmp_path / "images/e-w")
+    del source.__dict__["photograph_files"]
+    with pytest.raises(InputError, match="1.JPG: would be the photograph of two cameras, '.*e-w.*' and '.*n-s.*'"):
+        frames_of(source)
+
+
+def test_deleted_photographs_of_other_folders_do_not_take_those_of_equal_names(tmp_path):
+    source = meshroom_in_folders(tmp_path)
+    (tmp_path / "images/n-s/1.JPG").unlink()
+    frames = frames_of(source)
+    assert [frame.image.name for frame in frames] == ["1.JPG", "2.jpeg"] and len(source.without_photograph) == 1
+
+
+@pytest.mark.parametrize("name", ["images\\{}.png", "D:/else/images/{}.png", "./images/{}", "IMAGES/{}.PNG"])
+def test_paths_of_another_computer_in_transforms(tmp_path, name):
+    top = {"fl_x": 70.0, "fl_y": 76.0, "cx": 28.5, "cy": 27.25}
+    source = transforms(tmp_path / "data", top, [{"file_path": f"images/{k}.png"} for k in range(3)],
+                        lambda k: noise(np.uint8, seed=k))  # fmt: skip
+    content = json.loads((source / "transforms.json").read_text())
+    for k, frame in enumerate(content["frames"]):
+        frame["file_path"] = name.format(k)
+    (source / "transforms.json").write_text(json.dumps(content))
+    (source / "images/._0.png").write_bytes(b"of macOS")
+    frames = frames_of(Transforms(source, Path()))
+    assert [frame.image for frame in frames] == [source / f"images/{k}.png" for k in range(3)]
+
+
+# Sizes
+
+
+def projected(frame):
+    """Pixels of the points in the photograph as it is written, by the frame's camera."""
+    x = (POINTS - frame.pose[:3, 3]) @ frame.pose[:3, :3]
+    return frame.lens.colmap.img_from_cam(x)
+
+
+@pytest.mark.parametrize("make", [metashape, alicevision])
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_cameras_are_scaled_to_reduced_photographs(tmp_path, make, factor):
+    kind = Metashape if make is metashape else SfmData
+    before = frames_of(kind(path := make(tmp_path), Path()))
+    for file in (tmp_path / "images").iterdir():
+        Image.open(file).resize((int(SIZE[0] * factor), int(SIZE[1] * factor))).save(file)
+    after = frames_of(source := kind(path, Path()))
+    adapt_all(source, after)
+    require_frames(after, path)
+    for a, b in zip(before, after, strict=True):
+        np.testing.assert_allclose(projected(b), factor * projected(a), atol=1e-5)
+    small = " x ".join(str(int(factor * side)) for side in SIZE)
+    assert source.notes == [f"3 cameras scaled from 62 x 52 to the {small} pixels of their photographs"]
+
+
+def test_cameras_of_colmap_are_scaled_to_reduced_photographs(tmp_path, capsys):
+    folder = colmap_folder(tmp_path)
+    for file in (folder / "images").rglob("*.jpg"):
+        picture = Image.open(file)
+        picture.resize((31, 26)).save(file)
+    shutil.rmtree(folder / "masks")
+    scene = converted("colmap", folder, tmp_path / "small.xml", "--no-exif")
+    for shot in scene.shots:
+        np.testing.assert_allclose([*shot.camera.focal, *shot.camera.centre], K[[0, 1, 0, 1], [0, 1, 2, 2]] / 2)
+    assert "3 cameras scaled from 62 x 52 to the 31 x 26 pixels" in capsys.readouterr().out
+
+
+def test_photographs_are_turned_as_their_cameras_are(tmp_path):
+    """Cameras are for upright photographs, files are stored on their sides: a spot comes where the camera puts it."""
+    R, t = next(cameras())
+    x = POINTS @ R.T + t
+    size, f, c = (52, 62), (70.0, 76.0), (27.25, 28.5)
+    spot = np.floor(x[0, :2] / x[0, 2] * f + c).astype(int)
+    upright = np.zeros((size[1], size[0], 3), np.uint8)
+    upright[spot[1], spot[0]] = 255
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
+    pose = pose @ np.diag([1.0, -1, -1, 1])
+    for orientation, turn in ((6, lambda p: np.rot90(p)), (8, lambda p: np.rot90(p, -1))):
+        folder = tmp_path / str(orientation)
+        exif = Image.Exif()
+        exif[274] = orientation
+        write(folder / "m.png", np.ascontiguousarray(turn(upright)[..., :1]))
+        Image.fromarray(np.ascontiguousarray(turn(upright))).save(folder / "a.png", exif=exif)
+        frames = [{"file_path": "a.png", "mask_path": "m.png", "transform_matrix": pose.tolist()}]
+        top = {"fl_x": f[0], "fl_y": f[1], "cx": c[0], "cy": c[1], "w": size[0], "h": size[1], "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(top))
+        scene = converted("transforms", folder, tmp_path / f"{orientation}.xml")
+        assert (scene.images[0] == upright).all() and (scene.masks[0] == upright[..., 0]).all()
+
+
+def test_photographs_of_another_size_are_refused_with_what_to_do(tmp_path):
+    path = metashape(tmp_path)
+    for size, pattern in (((52, 62), "the sides are exchanged"), ((61, 52), "give photographs of the size of")):
+        for file in (tmp_path / "images").iterdir():
+            Image.new("RGB", size).save(file)
+        with pytest.raises(InputError, match=f"photograph: is {size[0]} x {size[1]} pixels, but its camera 62 x 52; "
+                           f"{pattern}"):  # fmt: skip
+            convert.main(["metashape", str(path), str(tmp_path / "a.xml")])
+
+
+# Masks
+
+
+@pytest.mark.parametrize("names", ["{}.png", "{}.jpg.PNG", "{}.JPG", "sub/{}.png"])
+@pytest.mark.parametrize("kind", ["metashape", "transforms", "sfmdata"])
+def test_masks_beside_the_photographs_are_found(tmp_path, kind, names, capsys):
+    if kind == "metashape":
+        source = metashape(tmp_path)
+        stems = [name.split(".")[0] for name in NAMES]
+    elif kind == "sfmdata":
+        source = alicevision(tmp_path)
+        stems = [name.split(".")[0] for name in NAMES]
+    else:
+        top = {"fl_x": 70.0, "fl_y": 76.0}
+        source = transforms(tmp_path, top, [{"file_path": f"images/{k}.png"} for k in range(3)],
+                            lambda k: noise(np.uint8, seed=k))  # fmt: skip
+        stems = ["0", "1", "2"]
+    if ".jpg." in names and kind == "transforms":
+        names = names.replace(".jpg", ".png")
+    for k, stem in enumerate(["other", *stems[:2]]):
+        file = tmp_path / "masks" / names.format(stem)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", SIZE, 10 * k).save(file)
+    if ".jpg." in names:
+        (tmp_path / "masks/b.jpg.PNG").rename(tmp_path / "masks/b.png.PNG")
+    scene = converted(kind, source, tmp_path / "s.xml")
+    assert [None if mask is None else int(mask[0, 0]) for mask in scene.masks] == [10, 20, None]
+    printed = capsys.readouterr().out
+    assert "1 photograph without a mask in" in printed and "1 mask in" in printed and "2 with masks" in printed
+
+
+def test_masks_that_are_named_otherwise_are_told(tmp_path, capsys):
+    path = metashape(tmp_path)
+    (tmp_path / "masks").mkdir()
+    Image.new("L", SIZE).save(tmp_path / "masks/other.png")
+    convert.main(["metashape", str(path), str(tmp_path / "s.xml")])
+    assert "masks: none of its 1 images is named after a photograph; not used" in capsys.readouterr().out
+    with pytest.raises(InputError, match="--masks: has no mask of a.JPG, such as a.JPG.png or a.png"):
+        convert.main(["metashape", str(path), str(tmp_path / "t.xml"), "--masks", str(tmp_path / "masks")])
+
+
+# What is left out
+
+
+def test_what_is_left_out_is_said(tmp_path, capsys):
+    path = metashape(tmp_path)
+    (tmp_path / "images/b.png").unlink()
+    Image.new("RGB", SIZE).save(tmp_path / "images/new.png")
+    convert.main(["metashape", str(path), str(tmp_path / "s.xml")])
+    printed = capsys.readouterr().out
+    assert "1 of 3 photographs left out, without a pose: lost\n" in printed
+    assert f"1 camera left out, without a photograph in {tmp_path / 'images'}: b\n" in printed
+    assert f"1 image in {tmp_path / 'images'} left out, without a camera: new.png\n" in printed
+    assert "2 photographs, 0 with masks, of 2 cameras" in printed
+
+
+def test_the_largest_model_of_colmap_is_taken(tmp_path, capsys):
+    folder = colmap_folder(tmp_path)
+    (folder / "sparse/0").rename(folder / "sparse/1")
+    shutil.copytree(folder / "text", folder / "sparse/0")
+    path = folder / "sparse/0/images.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:-2]))
+    converted("colmap", folder, tmp_path / "s.xml")
+    printed = capsys.readouterr().out
+    assert f"{folder / 'sparse/1'} is taken, with 3 photographs; not used: {folder / 'sparse/0'} (2)" in printed
+    for suffix in (".bin", ".txt"):
+        for file in (folder / "sparse/1").glob(f"*{suffix}"):
+            file.unlink()
+
+
+def test_cameras_of_colmap_without_lines_of_points_are_refused(tmp_path):
+    folder = colmap_folder(tmp_path) / "text"
+    path = folder / "images.txt"
+    lines = [line for line in path.read_text().splitlines() if line.startswith("#") or line.endswith(".jpg")]
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"images.txt: line \d+: must be the points of the camera in the line before"):
+        converted("colmap", folder, tmp_path / "s.xml", "--images", folder.parent / "images")
