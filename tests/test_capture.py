@@ -186,7 +186,7 @@ def test_small_photographs_are_remembered_as_many_as_fit(small_capture, monkeypa
 def opened_files(monkeypatch):
     """Names of the photographs and masks that have been read whole."""
     calls, read = [], decoding.read_image
-    monkeypatch.setattr(decoding, "read_image", lambda path: calls.append(path.name) or read(path))
+    monkeypatch.setattr(decoding, "read_image", lambda path, **how: calls.append(path.name) or read(path, **how))
     return calls
 
 

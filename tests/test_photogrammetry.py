@@ -382,7 +382,7 @@ def test_pictures_of_a_folder(tmp_path):
     found = find_pictures(tmp_path)
     assert [p.path.name for p in found] == ["0.JPG", "1.JPG", "2.JPG", "3.dng", *(f"{k}.JPG" for k in range(4, 8))]
     assert found[0].size == (9, 6) and found[0].pixels.shape == (6, 9, 3)
-    with pytest.raises(InputError, match=r"3.dng: cannot be read as raw photograph"):
+    with pytest.raises(InputError, match=r"3.dng: cannot be read as photograph"):
         _ = found[3].pixels
     for k in range(4):
         (tmp_path / f"{k}.JPG").unlink()

@@ -254,6 +254,6 @@ def test_inks_are_not_taken_for_light(tmp_path):
     inks = Image.new("CMYK", (9, 7), (20, 90, 200, 10))
     inks.save(tmp_path / "a.tif")
     inks.save(tmp_path / "a.jpg")
-    with pytest.raises(InputError, match=r"a.tif: cannot be read as image \(its colours are CMYK; save"):
-        _ = Picture(tmp_path / "a.tif").pixels
-    assert Picture(tmp_path / "a.jpg").pixels.shape == (7, 9, 3)  # Pillow converts these
+    for name in ("a.tif", "a.jpg"):
+        with pytest.raises(InputError, match=rf"{name}: cannot be read as photograph \(its colours .* CMYK; save"):
+            _ = Picture(tmp_path / name).pixels

@@ -208,7 +208,7 @@ def picture(name: str, write: Callable[[Path], object]) -> Callable[[Path], Read
             for ask in (image_size, has_alpha, exif_values, pixels_of):
                 documented(lambda ask=ask: ask(path))
             one = Picture(path)
-            for ask in ("exif", "exposure", "camera_orientation", "size", "pixels"):
+            for ask in ("exif", "camera_orientation", "size", "pixels", "mask_pixels"):
                 documented(lambda ask=ask: getattr(one, ask))
 
         return Reader([path], read)
@@ -234,7 +234,7 @@ def own_picture(name: str, write: Callable[[Path], object]) -> Callable[[Path], 
 
         def read() -> None:
             one = Picture(path)
-            for ask in ("exif", "exposure", "camera_orientation", "size", "pixels"):
+            for ask in ("exif", "camera_orientation", "size", "pixels"):
                 documented(lambda ask=ask: getattr(one, ask))
 
         return Reader([path], read)
