@@ -55,9 +55,9 @@ def by_library(pairs: Pairs, folder: Path, guided: bool) -> None:
 
 def match(name: str, pairs: Pairs, folder: Path) -> None:
     """Match pairs of files with one of the `MATCHERS`."""
-    descriptors = matching.read_descriptors(folder / "database.db")
     if name in ("products", "chosen"):
-        list(progress(matching.match_pairs(pairs, descriptors, folder), name, len(pairs)))
+        features = matching.read_features(folder / "database.db")
+        list(progress(matching.match_pairs(pairs, features, folder), name, len(pairs)))
         return
     for batch in progress(list(matching.batches(pairs, matching.BATCH)), name):
         by_library(batch, folder, name == "guided")
@@ -116,7 +116,8 @@ def main() -> None:
     spent, passed = clocked(lambda: matching.find_features(pictures, features, progress))
     true = {f.image.stem: f.pose for f in frames_of(detect(options.truth))} if options.truth else {}
     files = [matching.grey_file(picture) for picture in pictures]
-    descriptors = matching.read_descriptors(features / "database.db")
+    known = matching.read_features(features / "database.db")
+    descriptors = [known[file].descriptors for file in files]
     rows = []
     for name in options.matchers:
         folder = options.out / name
@@ -126,7 +127,7 @@ def main() -> None:
         (folder / "grey").symlink_to(features.absolute() / "grey")
         numbers = list(itertools.combinations(range(len(files)), 2))
         if name == "chosen":
-            numbers = matching.pairs_to_match([descriptors[file] for file in files])
+            numbers = matching.pairs_to_match(descriptors)
         if options.timed:
             numbers = np.random.default_rng(0).permutation(numbers)[: options.timed].tolist()
         pairs = [(files[a], files[b]) for a, b in numbers]
@@ -143,7 +144,7 @@ def main() -> None:
     heads += ["rotation [°]", "worst", "position", "worst"] if true else []
     heads = heads[:6] if options.timed else heads
     print("\n" + table([*heads, "s for cameras"], rows))
-    count = np.median([len(own) for own in descriptors.values()])
+    count = np.median([len(own) for own in descriptors])
     print(f"\n{len(pictures)} photographs, {count:.0f} features each (median), {spent / len(pictures):.2f} processor "
           f"seconds each, {passed / len(pictures):.2f} passed; {processor()}, {datetime.date.today()}")  # fmt: skip
 

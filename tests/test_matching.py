@@ -18,7 +18,11 @@ def silent(things, *_):
 
 def normalised(random, *shape):
     """Descriptors (n, 128) as SIFT writes them."""
-    values = random.uniform(0, 1, (*shape, 128)) ** 4
+    return as_sift(random.uniform(0, 1, (*shape, 128)) ** 4)
+
+
+def as_sift(values):
+    """Values (n, 128) as bytes of norm 512."""
     return np.rint(512 * values / np.linalg.norm(values, axis=-1, keepdims=True)).clip(0, 255).astype(np.uint8)
 
 
@@ -50,8 +54,9 @@ def test_matches_are_those_of_brute_force(sizes, monkeypatch):
         first[5] = second[-10] = 0  # no direction at all
     expected = by_brute_force(first, second)
     assert len(expected) >= shared / 3 and (len(expected) < shared or shared < 2)
-    found = matching.match_descriptors(torch.tensor(first), torch.tensor(second))
-    assert found.dtype == np.uint32 and found.tolist() == [list(map(int, pair)) for pair in expected]
+    found, ratios = matching.match_descriptors(torch.tensor(first), torch.tensor(second))
+    assert found.dtype == np.uint32 and ratios.max(initial=0) < matching.LOOSE
+    assert found[ratios < 0.8].tolist() == [list(map(int, pair)) for pair in expected]
 
 
 def test_all_pairs_of_few_photographs_are_matched():
@@ -98,15 +103,13 @@ def folder(tmp_path, monkeypatch):
 
 
 def content(database):
-    """Cameras by files, matches by pairs of files, and the number of verified ones of each pair that was verified."""
+    """Cameras by files, and the verified matches of each pair of files."""
     with matching.pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         pairs = {frozenset((names[a], names[b])): (a, b) for a, b in itertools.combinations(names, 2)}
-        matches = {pair: opened.read_matches(*ids).tolist() for pair, ids in pairs.items()
-                   if opened.exists_matches(*ids)}  # fmt: skip
-        verified = {pair: len(opened.read_two_view_geometry(*ids).inlier_matches) for pair, ids in pairs.items()
+        verified = {pair: opened.read_two_view_geometry(*ids).inlier_matches.tolist() for pair, ids in pairs.items()
                     if opened.exists_two_view_geometry(*ids)}  # fmt: skip
-    return matching.camera_ids(database), matches, verified
+    return matching.camera_ids(database), verified
 
 
 def test_photographs_that_show_the_same_match(folder, monkeypatch):
@@ -119,19 +122,19 @@ def test_photographs_that_show_the_same_match(folder, monkeypatch):
 
     matching.find_features(pictures, folder / "work", progress)
     matching.match_features(pictures, folder / "work", progress)
-    assert shown == [("features", 8), ("pairs", 28)]
-    cameras, matches, verified = content(folder / "work/database.db")
-    assert len(matches) == len(verified) == 28
+    assert shown == [("features", 8), ("matching", 28)]
+    cameras, verified = content(folder / "work/database.db")
+    assert len(verified) == 28
     blank = matching.grey_file(pictures[3])
-    assert all((n == 0) == (blank in pair) for pair, n in verified.items())
-    assert min(n for pair, n in verified.items() if blank not in pair) > 40
+    assert all((not found) == (blank in pair) for pair, found in verified.items())
+    assert min(len(found) for pair, found in verified.items() if blank not in pair) > 40
     files = [matching.grey_file(picture) for picture in pictures]
     assert len({cameras[file] for file in files[:6]}) == len({cameras[file] for file in files[6:]}) == 1
     assert cameras[files[0]] != cameras[files[6]]
 
 
 def test_what_an_earlier_run_has_found_is_kept(folder, monkeypatch):
-    """Features of one batch, matches of COLMAP's own matcher, matches that were not verified yet."""
+    """Features of one batch, and pairs that COLMAP's own matcher has matched."""
     pictures, work = find_pictures(folder), folder / "work"
     database, pycolmap = work / "database.db", matching.pycolmap
     matching.find_features(pictures[:5], work, silent)
@@ -139,44 +142,78 @@ def test_what_an_earlier_run_has_found_is_kept(folder, monkeypatch):
     (work / "pairs.txt").write_text(f"{files[0]} {files[1]}\n{files[1]} {files[2]}\n")
     options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
     pycolmap.match_image_pairs(database, options, pycolmap.ImportedPairingOptions(match_list_path=work / "pairs.txt"))
-    with pycolmap.Database.open(database) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        before = content(database)
-        some = opened.read_matches(ids[files[0]], ids[files[1]])[:3]
-        opened.write_matches(ids[files[0]], ids[files[2]], some)
+    before = content(database)
     decoded = []
     grey = Picture.grey
     monkeypatch.setattr(Picture, "grey", lambda self, longest: decoded.append(self.name) or grey(self, longest))
     matching.find_features(pictures, work, silent)
     assert sorted(decoded) == [picture.name for picture in pictures[5:]]
     matching.match_features(pictures, work, silent)
-    cameras, matches, verified = content(database)
+    cameras, verified = content(database)
     assert before[0].items() <= cameras.items() and cameras[files[5]] == cameras[files[0]]
-    assert before[1].items() <= matches.items() and before[2].items() <= verified.items()
-    assert len(verified) == 28 and verified[frozenset((files[0], files[2]))] == 0  # verified now
-    monkeypatch.setattr(matching, "match_descriptors", None)  # nothing is left to do
+    assert len(before[1]) == 2 and before[1].items() <= verified.items() and len(verified) == 28
+    monkeypatch.setattr(matching, "match_pair", None)  # nothing is left to do
     matching.match_features(pictures, work, silent)
-    assert content(database) == (cameras, matches, verified)
+    assert content(database) == (cameras, verified)
+
+
+def two_views(random, plane):
+    """Points of a scene, or of a plane, in two photographs (n, 2), by the same camera."""
+    camera = matching.pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 900, 800, 600)
+    points = random.uniform([-1, -0.7, 4], [1, 0.7, 6], (400, 3))
+    points[:, 2] = 5 + 0.3 * points[:, 0] if plane else points[:, 2]
+    turn = cv2.Rodrigues(np.array([0.04, -0.17, 0.06]))[0]
+    matrix = np.array([[900, 0, 400], [0, 900, 300], [0, 0, 1.0]])
+    views = [points @ matrix.T, (points @ turn.T + [0.9, 0.2, 0.3]) @ matrix.T]
+    return camera, [view[:, :2] / view[:, 2:] for view in views]
+
+
+@pytest.mark.parametrize("plane", [False, True])
+def test_ambiguous_features_match_where_the_geometry_says(plane):
+    """All features have a rival that fails the ratio test but one in five, and half of the rest are elsewhere."""
+    pytest.importorskip("pycolmap")
+    random = np.random.default_rng(6)
+    camera, (first, second) = two_views(random, plane)
+    own = normalised(random, 400)
+    other, rivals = (as_sift((own + random.normal(0, noise, own.shape)).clip(0)) for noise in (8.5, 9))
+    rivals[::5] = normalised(random, 80)
+    wrong = random.permutation(400)[:200]
+    wrong = wrong[wrong % 5 > 0]
+    second[wrong] = random.uniform([0, 0], [800, 600], (len(wrong), 2))
+    elsewhere = random.uniform([0, 0], [800, 600], (400, 2))
+    images = [
+        matching.Features(k, camera, points, torch.tensor(descriptors))
+        for k, points, descriptors in (
+            (1, first, own), (2, np.concatenate([second, elsewhere]), np.concatenate([other, rivals])),
+        )
+    ]  # fmt: skip
+    found = matching.match_pair(*images).inlier_matches.astype(int)
+    _, ratios = matching.match_descriptors(*(image.descriptors for image in images))
+    right = (found[:, 0] == found[:, 1]) & ~np.isin(found[:, 0], wrong)
+    assert right.sum() > 1.3 * (ratios < matching.RATIO).sum()
+    assert right.mean() > 0.95
+    back = matching.match_pair(*images[::-1]).inlier_matches[:, ::-1].tolist()
+    assert len(set(map(tuple, back)) & set(map(tuple, found))) > 0.95 * len(found)
 
 
 def test_an_interrupted_run_loses_at_most_a_batch(folder, monkeypatch):
     pictures, work = find_pictures(folder), folder / "work"
     matching.find_features(pictures, work, silent)
-    calls, match = [], matching.match_descriptors
+    calls, match = [], matching.match_pair
 
-    def interrupted(*descriptors):
+    def interrupted(*features):
         calls.append(1)
         if len(calls) == 12:
             raise KeyboardInterrupt
-        return match(*descriptors)
+        return match(*features)
 
     monkeypatch.setattr(matching, "BATCH", 4)
     monkeypatch.setattr(matching, "in_parallel", lambda *arguments: list(map(*arguments)))
-    monkeypatch.setattr(matching, "match_descriptors", interrupted)
+    monkeypatch.setattr(matching, "match_pair", interrupted)
     with pytest.raises(KeyboardInterrupt):
         matching.match_features(pictures, work, silent)
     matching.match_features(pictures, work, silent)
-    assert len(calls) == 28 + 4 and len(content(work / "database.db")[2]) == 28
+    assert len(calls) == 28 + 4 and len(content(work / "database.db")[1]) == 28
 
 
 def test_photographs_from_one_place_are_refused(folder):

@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -24,13 +24,15 @@ pycolmap = LazyPackage("pycolmap", "structure from motion")
 LONGEST, FEATURES, PEAK = 1600, 4096, 0.003
 DECODED = 2  #: photographs that are decoded at a time
 LENGTH = 512.0  #: of a descriptor
-#: Largest angle between the descriptors of a match [radians], also as a share of the angle to the second nearest one.
-ANGLE, RATIO = 0.7, 0.8
+#: Largest angle between the descriptors of a match [radians], also as a share of the angle to the second nearest one:
+#: RATIO to find the geometry of two photographs, LOOSE for matches that agree with it.
+ANGLE, RATIO, LOOSE = 0.7, 0.8, 1.0
+FAR = 4.0  #: the largest distance of a match that agrees [px]
 BLOCK = 512  #: rows of a matrix of products that is computed at a time, so that it stays in the processor's cache
 ALL_PAIRS = 60  #: all pairs of up to this number of photographs are matched
 SIMILAR, NEIGHBOURS = 30, 12  #: with more: each photograph with the most similar ones, and those next to it by name
 WORDS = 4096  #: descriptors to which the others are compared to see which photographs are similar
-BATCH = 60  #: pairs that are verified at a time
+BATCH = 60  #: pairs that are matched at a time
 MIN_MATCHES = 50  #: of a pair of photographs that overlap
 #: A pair is static if the features' motion varies by less than STATIC [widths]. MAX_STATIC: largest share of them.
 STATIC, MAX_STATIC = 0.01, 0.9
@@ -89,17 +91,33 @@ def camera_ids(database: Path) -> dict[str, int]:
         return {image.name: image.camera_id for image in opened.read_all_images()}
 
 
-def read_descriptors(database: Path) -> dict[str, torch.Tensor]:
-    """The descriptors (n, 128) uint8 of the images in COLMAP's database, by file."""
+class Features(NamedTuple):
+    """The features of an image in COLMAP's database."""
+
+    image: int  #: its number there
+    camera: Any  #: pycolmap's camera
+    points: np.ndarray  #: (n, 2) where they are [px]
+    descriptors: torch.Tensor  #: (n, 128) uint8
+
+
+def read_features(database: Path) -> dict[str, Features]:
+    """The features of the images in COLMAP's database, by file."""
     with pycolmap.Database.open(database) as opened:
-        images = opened.read_all_images()
-        return {i.name: torch.tensor(opened.read_descriptors(i.image_id).data).reshape(-1, 128) for i in images}
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        return {
+            image.name: Features(
+                image.image_id, cameras[image.camera_id], opened.read_keypoints(image.image_id)[:, :2].astype(float),
+                torch.tensor(opened.read_descriptors(image.image_id).data).reshape(-1, 128),
+            )
+            for image in opened.read_all_images()
+        }  # fmt: skip
 
 
 def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The most similar one of the `others` (m, 128) to each descriptor (n, 128): indices (n,), and is it a match (n,)?
+    """The most similar one of the `others` (m, 128) to each descriptor (n, 128): indices (n,) and ratios (n,).
 
-    A match must pass the ratio test. Products of integers are exact in float32.
+    A ratio is the angle to that one by the angle to the second nearest one; infinite if they are too far apart for a
+    match. Products of integers are exact in float32.
     """
     others = torch.cat([others.float(), torch.zeros(1, others.shape[1])])  # the second nearest one if there is only one
     buffer, found = torch.empty(BLOCK, len(others)), []  # new memory for each block would take longer than its product
@@ -109,16 +127,52 @@ def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tens
         found.append((index, first, products.scatter_(1, index[:, None], 0).amax(1)))
     index, *cosines = map(torch.cat, zip(*found))
     first, second = (torch.acos((cosine.double() / LENGTH**2).clamp(max=1)) for cosine in cosines)
-    return index, (first <= ANGLE) & (first < RATIO * second)
+    return index, torch.where(first <= ANGLE, first / second, torch.inf)
 
 
-def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-    """Matches (k, 2) uint32 between descriptors (n, 128) and (m, 128): those that are nearest to each other."""
-    there, passed = nearest(first, second)
-    rows = passed.nonzero()[:, 0]
-    back, passed = nearest(second[there[rows]], first)
-    rows = rows[passed & (back == rows)]
-    return torch.stack([rows, there[rows]], 1).numpy().astype(np.uint32)
+def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Matches (k, 2) uint32 between descriptors (n, 128) and (m, 128): those that are nearest to each other.
+
+    Also their ratios (k,), the larger one of both directions. They are less than `LOOSE`.
+    """
+    there, ratio = nearest(first, second)
+    rows = (ratio < LOOSE).nonzero()[:, 0]
+    back, other = nearest(second[there[rows]], first)
+    mutual = (back == rows) & (other < LOOSE)
+    rows = rows[mutual]
+    ratios = torch.maximum(ratio[rows], other[mutual])
+    return torch.stack([rows, there[rows]], 1).numpy().astype(np.uint32), ratios.numpy()
+
+
+def match_pair(first: Features, second: Features) -> Any:
+    """The geometry of two images, found by COLMAP's library, with all matches that agree with it.
+
+    The ratio test finds the geometry. Among matches that agree with the geometry few are wrong even if their ratio is
+    near 1 (two similar features on an object, say), so these are kept as well.
+    """
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0  # otherwise it depends on the thread
+    matches, ratios = match_descriptors(first.descriptors, second.descriptors)
+    geometry = pycolmap.estimate_two_view_geometry(
+        first.camera, first.points, second.camera, second.points, matches[ratios < RATIO], options
+    )
+    if len(geometry.inlier_matches):
+        a, b = (own.points[column] for own, column in zip((first, second), matches.T))
+        geometry.inlier_matches = matches[distances(geometry, a, b) <= FAR]
+    return geometry
+
+
+def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """How far matches (k, 2) [px] are from the geometry of two images [px].
+
+    If that is a plane, or one viewpoint: from where the homography maps the first point. Otherwise Sampson's distance
+    from the epipolar line.
+    """
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    if geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
+        mapped = np.column_stack([first, np.ones(len(first))]) @ geometry.H.T
+        return np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - second, axis=1)
+    return np.sqrt(pycolmap.compute_squared_sampson_error(first, second, geometry.F))
 
 
 def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]:
@@ -148,10 +202,10 @@ def count_words(descriptors: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
     """Match the pairs that the database lacks. Raises InputError if the first batch is from one viewpoint."""
-    descriptors = read_descriptors(folder / "database.db")
+    features = read_features(folder / "database.db")
     files = [grey_file(picture) for picture in pictures]
-    pairs = [(files[a], files[b]) for a, b in pairs_to_match([descriptors[file] for file in files])]
-    for number, _ in enumerate(progress(match_pairs(pairs, descriptors, folder), "matching", len(pairs)), 1):
+    pairs = [(files[a], files[b]) for a, b in pairs_to_match([features[file].descriptors for file in files])]
+    for number, _ in enumerate(progress(match_pairs(pairs, features, folder), "matching", len(pairs)), 1):
         if number == min(BATCH, len(pairs)):
             share = static_share(folder / "database.db", pairs[:number])
             if share >= MAX_STATIC:
@@ -160,22 +214,16 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
 
 
 def match_pairs(
-    pairs: Sequence[tuple[str, str]], descriptors: Mapping[str, torch.Tensor], folder: Path
+    pairs: Sequence[tuple[str, str]], features: Mapping[str, Features], folder: Path
 ) -> Iterator[tuple[str, str]]:
-    """The pairs of files as soon as the database has their verified matches. Existing ones are kept."""
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0  # otherwise it depends on the thread
-    database, listed = folder / "database.db", folder / "pairs.txt"
-    for batch in batches(pairs, BATCH):
-        with pycolmap.Database.open(database) as opened:
-            ids = {file: opened.read_image_with_name(file).image_id for pair in batch for file in pair}
-            if new := [pair for pair in batch if not opened.exists_matches(ids[pair[0]], ids[pair[1]])]:
-                found = in_parallel(match_descriptors, *([descriptors[file] for file in files] for files in zip(*new)))
-                for (a, b), matches in zip(new, found):
-                    opened.write_matches(ids[a], ids[b], matches)
-        listed.write_text("".join(f"{a} {b}\n" for a, b in batch), "utf-8")
-        interruptible(pycolmap.verify_matches, database, listed, verification)
-        yield from batch
+    """The pairs of files as soon as the database has their geometry. Existing ones are kept."""
+    with pycolmap.Database.open(folder / "database.db") as opened:
+        for batch in batches(pairs, BATCH):
+            both = [(features[a], features[b]) for a, b in batch]
+            if new := [(a, b) for a, b in both if not opened.exists_two_view_geometry(a.image, b.image)]:
+                for (a, b), geometry in zip(new, in_parallel(match_pair, *zip(*new))):
+                    opened.write_two_view_geometry(a.image, b.image, geometry)
+            yield from batch
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
