@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_ring.errors import InputError
+from mi_ring.importers.bundler import Bundler
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.diligent_mv import DiligentMV
 from mi_ring.importers.frames import Source
@@ -14,15 +15,18 @@ from mi_ring.importers.llff import Llff
 from mi_ring.importers.metashape import Metashape, find_chunk
 from mi_ring.importers.middlebury import Middlebury
 from mi_ring.importers.neus import Neus
+from mi_ring.importers.opensfm import OpenSfm
 from mi_ring.importers.reading import list_images, load_json, load_xml
 from mi_ring.importers.realitycapture import POSE, RealityCapture, read_csv, xmp_fields
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
+from mi_ring.importers.visualsfm import VisualSfm
 
 FORMATS = {
     "diligent-mv": DiligentMV, "transforms": Transforms, "colmap": Colmap, "neus": Neus, "iron": Iron,
     "metashape": Metashape, "realitycapture": RealityCapture, "sfmdata": SfmData, "llff": Llff,
-    "middlebury": Middlebury,
+    "middlebury": Middlebury, "bundler": Bundler, "visualsfm": VisualSfm,
+    "opensfm": OpenSfm,
 }  # fmt: skip
 
 

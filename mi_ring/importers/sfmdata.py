@@ -11,7 +11,7 @@ from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import load_json, matrix
+from mi_ring.importers.reading import load_json, matrix, require_object
 
 #: Number of coefficients of each distortion model, by both programs' names. Of five, the last two are tangential.
 MODELS = {
@@ -96,13 +96,6 @@ class SfmData(Photogrammetry):
         """The frame of a photograph, which may have been moved; nothing if there is no such photograph."""
         if own := self.photograph(file, what, relative=True):
             yield Frame(own, lens, pose, said=file)
-
-
-def require_object(value: Any, what: str) -> dict:
-    """Return the value. Raises InputError, which begins with `what`, if it is no JSON object."""
-    if not isinstance(value, dict):
-        raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
-    return value
 
 
 def file_name(view: dict, field: str, what: str) -> str:

@@ -1,0 +1,142 @@
+"""Cameras in the files of Bundler, VisualSFM, OpenSfM, Polycam, Record3D and Blender, by their documentation.
+
+Photographs have different lenses and sizes. `projections` gives where each program's own formulas put the points.
+"""
+
+import json
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from helpers.photogrammetry_files import NAMES, POINTS, cameras, photographs, text_of
+
+SIZES = [(62, 52), (52, 90), (80, 61)]
+FLIP = np.diag([1.0, -1.0, -1.0])  #: between cameras with y up, -z forward and cameras with y down, z forward
+
+
+def seen(k):
+    """The points in the axes of camera k: x right, y down, z forward."""
+    R, t = list(cameras())[k]
+    return POINTS @ R.T + t
+
+
+def photographs_of_sizes(folder, names=NAMES, sizes=SIZES):
+    for name, size in zip(names, sizes):
+        photographs(folder, [name], size)
+    return folder
+
+
+# Bundler
+
+BUNDLER = [(70.0, -0.2, 0.05), (95.0, 0.0, 0.0), (81.5, 0.1, -0.03)]
+
+
+def bundler(folder, list_lines="{} 0 600.5"):
+    """The manual of version 0.4. A camera without a pose is in the middle."""
+    lines = ["# Bundle file v0.3", f"{len(NAMES) + 1} 1"]
+    for (f, k1, k2), (R, t) in zip(BUNDLER, cameras()):
+        lines += [text_of([f, k1, k2]), *map(text_of, FLIP @ R), text_of(FLIP @ t)]
+    lines[7:7] = ["0 0 0"] * 5
+    lines += ["1.5 2.5 -3", "255 0 9", "2 0 17 -5.5 3.25 1 8 2.5 1"]
+    photographs_of_sizes(folder)
+    listed = [list_lines.format(name) for name in NAMES]
+    (folder / "list.txt").write_text("\n".join([listed[0], "lost one.jpg", *listed[1:], ""]))
+    (folder / "bundle").mkdir()
+    (folder / "bundle" / "bundle.out").write_text("\n".join([*lines, ""]))
+    return folder / "bundle" / "bundle.out"
+
+
+def bundler_pixels(k):
+    f, k1, k2 = BUNDLER[k]
+    P = seen(k) @ FLIP
+    p = -P[:, :2] / P[:, 2:]
+    r2 = (p**2).sum(1, keepdims=True)
+    x, y = (f * (1 + k1 * r2 + k2 * r2**2) * p).T
+    return np.stack([SIZES[k][0] / 2 + x, SIZES[k][1] / 2 - y], 1)  # from the middle; y is up
+
+
+# VisualSFM
+
+VISUALSFM = [(70.0, -0.15), (95.0, 0.0), (81.5, 0.2)]
+FIXED = (71.0, 30.25, 77.0, 27.5)  #: fx cx fy cy
+
+
+def visualsfm(folder, fixed=False):
+    """Two models, of which the second has more photographs."""
+    lines = []
+    for name, (f, r), (R, t) in zip(NAMES, VISUALSFM, cameras()):
+        quaternion = np.roll(Rotation.from_matrix(R).as_quat(), 1)
+        lines.append(f'my"photos\\{name}\t{f!r} {text_of(quaternion)} {text_of(-R.T @ t)} {r!r} 0')
+    photographs_of_sizes(folder / "my photos", sizes=[SIZES[0]] * 3 if fixed else SIZES)
+    first = f"NVM_V3 FixedK {text_of(FIXED)} 0" if fixed else "NVM_V3 "
+    point = "1 2 3 255 0 9 2 0 17 -5.5 3.25 1 8 2.5 1"
+    content = [first, "", "1", lines[1], "", "2", point, point, "", "3", *lines, "", "1", point, "", "0", "",
+               "#the last part of NVM file points to the PLY files", "0"]  # fmt: skip
+    (folder / "model.nvm").write_text("\n".join([*content, ""]))
+    return folder / "model.nvm"
+
+
+def visualsfm_pixels(k, fixed=False):
+    """Where the undistorted measurement, m (1 + r |m|²), is the projection: found by bisection."""
+    f, r = VISUALSFM[k]
+    fx, cx, fy, cy = FIXED if fixed else (f, SIZES[k][0] / 2, f, SIZES[k][1] / 2)
+    P = seen(k)
+    straight = P[:, :2] / P[:, 2:]
+    length = np.linalg.norm(straight, axis=1)
+    low, high = np.zeros(len(length)), 2 * length
+    for _ in range(80):
+        middle = (low + high) / 2
+        beyond = middle * (1 + r * middle**2) > length
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    return straight * (low / length)[:, None] * (fx, fy) + (cx, cy)
+
+
+# OpenSfM
+
+C = {"c_x": -0.04, "c_y": 0.03}
+OPENSFM = {
+    "perspective": {"focal": 1.1, "k1": -0.2, "k2": 0.05},
+    "brown": {"focal_x": 1.1, "focal_y": 1.25, **C, "k1": -0.2, "k2": 0.05, "k3": 0.02, "p1": 0.01, "p2": -0.02},
+    "radial": {"focal_x": 1.1, "focal_y": 1.25, **C, "k1": -0.2, "k2": 0.05},
+    "simple_radial": {"focal_x": 1.1, "focal_y": 1.25, **C, "k1": -0.2},
+    "fisheye": {"focal": 1.1, "k1": 0.1, "k2": -0.05},
+    "fisheye_opencv": {"focal_x": 1.1, "focal_y": 1.25, **C, "k1": 0.1, "k2": -0.05, "k3": 0.02, "k4": 0.01},
+}
+
+
+def opensfm(folder, kinds=("perspective", "brown", "fisheye_opencv"), edit=lambda models: None):
+    """Two reconstructions, of which the second has more shots."""
+    own = {"cameras": {}, "shots": {}, "points": {"9": {"color": [1, 2, 3], "coordinates": [1, 2, 3]}},
+           "reference_lla": {"latitude": 1, "longitude": 2, "altitude": 3}}  # fmt: skip
+    for k, (kind, name, (w, h), (R, t)) in enumerate(zip(kinds, NAMES, SIZES, cameras())):
+        own["cameras"][f"v2 {k}"] = {"projection_type": kind, "width": w, "height": h, **OPENSFM[kind]}
+        own["shots"][name] = {"rotation": Rotation.from_matrix(R).as_rotvec().tolist(), "translation": t.tolist(),
+                              "camera": f"v2 {k}", "orientation": 1, "capture_time": 0.0, "scale": 1.0,
+                              "gps_position": [1, 2, 3], "gps_dop": 15.0, "covariance": [], "merge_cc": 0}  # fmt: skip
+    models = [{"cameras": own["cameras"], "shots": {"b.png": own["shots"]["b.png"]}, "points": {}}, own]
+    edit(models)
+    photographs_of_sizes(folder / "images")
+    (folder / "opensfm").mkdir(exist_ok=True)
+    (folder / "opensfm" / "reconstruction.json").write_text(json.dumps(models))
+    return folder / "opensfm" / "reconstruction.json"
+
+
+def opensfm_pixels(k, kind):
+    """The page "Geometric Models" of the documentation."""
+    own = {"focal_x": OPENSFM[kind].get("focal"), "focal_y": OPENSFM[kind].get("focal"), **OPENSFM[kind]}
+    k1, k2, k3, k4, p1, p2, cx, cy = (own.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2", "c_x", "c_y"))
+    X, Y, Z = seen(k).T
+    if kind.startswith("fisheye"):
+        r = np.hypot(X, Y)
+        theta = np.arctan2(r, Z)
+        d = 1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8
+        x, y = d * theta * X / r, d * theta * Y / r
+    else:
+        a, b = X / Z, Y / Z
+        r2 = a**2 + b**2
+        d = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        x = a * d + 2 * p1 * a * b + p2 * (r2 + 2 * a**2)
+        y = b * d + 2 * p2 * a * b + p1 * (r2 + 2 * b**2)
+    u, v = own["focal_x"] * x + cx, own["focal_y"] * y + cy
+    w, h = SIZES[k]  # normalized coordinates: 1 is the longer side, 0 the middle
+    return np.stack([u * max(w, h) + w / 2, v * max(w, h) + h / 2], 1)

@@ -1,0 +1,168 @@
+"""Cameras of Bundler, VisualSFM, OpenSfM, rigs, phones and Blender: points land where the formulas put them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import structure_files
+from helpers.photogrammetry_files import NAMES
+
+from mi_ring import convert
+from mi_ring.errors import InputError
+from mi_ring.importers.bundler import Bundler
+from mi_ring.importers.frames import adapt_all, frames_of, require_frames
+from mi_ring.importers.opensfm import OpenSfm
+from mi_ring.importers.visualsfm import VisualSfm
+
+
+def taken(source):
+    frames = frames_of(source)
+    adapt_all(source, frames)
+    require_frames(frames, source.src)
+    return frames
+
+
+def landed(frame):
+    """Pixels of the points, by our camera's pose and the lens; the first pixel's centre is (0.5, 0.5)."""
+    x = (structure_files.POINTS - frame.pose[:3, 3]) @ frame.pose[:3, :3]
+    assert x[:, 2].min() > 0
+    return frame.lens.colmap.img_from_cam(x)
+
+
+def agree(frames, expected, names=NAMES):
+    assert [frame.image.name for frame in frames] == [*names]
+    for frame, pixels in zip(frames, expected, strict=True):
+        assert np.ptp(pixels, axis=0).min() > 5
+        np.testing.assert_allclose(landed(frame), pixels, atol=1e-5)
+
+
+def refused(arguments, pattern, folder):
+    out = folder / "out" / "scene.xml"
+    with pytest.raises(InputError, match=pattern) as error:
+        convert.main([*map(str, arguments), str(out)])
+    assert "\n" not in str(error.value) and not out.parent.exists()
+
+
+def edited(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    return path
+
+
+# Bundler
+
+
+@pytest.mark.parametrize("lines", ["{} 0 600.5", "{}", "./{}"])
+def test_bundler(tmp_path, lines):
+    path = structure_files.bundler(tmp_path, lines)
+    for src in (path, tmp_path):
+        source = Bundler(src, Path())
+        agree(taken(source), map(structure_files.bundler_pixels, range(3)))
+        assert source.without_pose == {"lost one.jpg"}
+
+
+def test_the_list_of_a_bundle_file_is_named_like_it(tmp_path):
+    path = structure_files.bundler(tmp_path)
+    path = path.rename(tmp_path / "pot.bundle.out")
+    (tmp_path / "list.txt").rename(tmp_path / "pot.list.txt")
+    (tmp_path / "list.txt").write_text("another.jpg\n")
+    agree(taken(Bundler(path, Path())), map(structure_files.bundler_pixels, range(3)))
+
+
+@pytest.mark.parametrize(("old", "new", "pattern"), [
+    ("# Bundle file v0.3", "ply", "does not begin with '# Bundle file'"),
+    ("4 1\n", "many 1\n", "line 2: is 'many'; must be the number of cameras"),
+    ("4 1\n", "0 1\n", "line 2: is '0'; must be the number of cameras"),
+    ("4 1\n", "3 1\n", "names 4 photographs, but bundle.out has 3 cameras"),
+    ("4 1\n", "400 1\n", "bundle.out: its 400 cameras: is"),
+    ("70.0 -0.2", "wide -0.2", "its 4 cameras: is .*; must be 60 numbers"),
+    ("70.0 -0.2", "-70.0 -0.2", "focal lengths above 0"),
+    ("70.0 -0.2", "70.0 nan", "its 4 cameras: has NaN"),
+])  # fmt: skip
+def test_mistakes_in_bundle_files(tmp_path, old, new, pattern):
+    refused(["bundler", edited(structure_files.bundler(tmp_path), old, new)], pattern, tmp_path)
+
+
+def test_a_bundle_file_without_its_list(tmp_path):
+    path = structure_files.bundler(tmp_path)
+    (tmp_path / "list.txt").unlink()
+    refused(["bundler", path], "bundle.out: list.txt: found neither .*list.txt nor .*list.txt", tmp_path)
+
+
+# VisualSFM
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_visualsfm(tmp_path, fixed):
+    source = VisualSfm(structure_files.visualsfm(tmp_path, fixed), Path())
+    agree(taken(source), [structure_files.visualsfm_pixels(k, fixed) for k in range(3)])
+    assert "of its 2 models number 2 is taken, with 3 photographs; not used: number 1 (1)" in source.notes[0]
+
+
+@pytest.mark.parametrize(("old", "new", "pattern"), [
+    ("NVM_V3", "NVM_V3_R9T", "begins with 'NVM_V3_R9T'; must be a file of VisualSFM's, NVM_V3"),
+    ("NVM_V3", "NVM_V3 FixedK 70 0 70 0 0", "FixedK: the principal point, 0 0, is far from the middle"),
+    ("NVM_V3", "NVM_V3 FixedK 70 0", r"FixedK fx cx fy cy: is of shape \(2,\)"),
+    ("\n3\n", "\n30\n", "has 7 of the 30 cameras"),
+    ("\n3\n", "\nthree\n", "found 'three' where the number of cameras or points must be"),
+    ("\t70.0 ", "\t", r"camera .*: is of shape \(9,\); must be 10 numbers"),
+    ("70.0 ", "wide ", "a.JPG': is wide|must be 10 numbers"),
+    ("70.0 ", "-70.0 ", "focal lengths above 0"),
+    ("0.2 0", "9 0", "c.jpeg': radial distortion: is 9, too strong"),
+    ("-0.15 0", "-1.5 0", "a.JPG': radial distortion: is -1.5, too strong"),
+])  # fmt: skip
+def test_mistakes_in_nvm(tmp_path, old, new, pattern):
+    refused(["visualsfm", edited(structure_files.visualsfm(tmp_path), old, new)], pattern, tmp_path)
+
+
+def test_a_quaternion_that_is_none(tmp_path):
+    path = structure_files.visualsfm(tmp_path)
+    lines = path.read_text().splitlines()
+    words = lines[10].split()
+    lines[10] = " ".join([*words[:2], "0", "0", "0", "0", *words[6:]])
+    path.write_text("\n".join(lines))
+    refused(["visualsfm", path], "quaternion: is of length 0; must be 1", tmp_path)
+
+
+# OpenSfM
+
+
+@pytest.mark.parametrize("kinds", [
+    ("perspective", "brown", "fisheye_opencv"), ("fisheye", "radial", "simple_radial"),
+])  # fmt: skip
+def test_opensfm(tmp_path, kinds):
+    path = structure_files.opensfm(tmp_path, kinds)
+    for src in (path, path.parent, tmp_path):
+        source = OpenSfm(src, Path())
+        agree(taken(source), [structure_files.opensfm_pixels(k, kind) for k, kind in enumerate(kinds)])
+        (note,) = source.notes
+        assert "of its 2 reconstructions number 2 is taken, with 3 photographs; not used: number 1 (1)" in note
+
+
+def test_unknown_fields_of_opensfm_are_named_once(tmp_path):
+    def edit(models):
+        for shot in models[1]["shots"].values():
+            shot["shear"] = 1
+        models[1]["cameras"]["v2 0"]["k3"] = 0.1  # a perspective camera has none
+        models[1]["cameras"]["v2 0"]["k1_prior"] = 0.1
+
+    source = OpenSfm(structure_files.opensfm(tmp_path, edit=edit), Path())
+    taken(source)
+    assert source.notes[1:] == [f"{source.src}: not used, because unknown: shear, k3"]
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (lambda models: models.clear(), "SRC: must be a list of reconstructions"),
+    (lambda models: models.append(3), r"\[2\]: is no object"),
+    (lambda models: models[1].pop("cameras"), r"\[1\].cameras: is missing"),
+    (lambda models: models[1]["cameras"].pop("v2 1"), "shots 'b.png'.camera: is missing"),
+    (lambda models: models[1]["cameras"]["v2 1"].update(projection_type="spherical"),
+     "cameras 'v2 1'.projection_type: is 'spherical'; must be one of perspective, "),
+    (lambda models: models[1]["cameras"]["v2 0"].pop("focal"), "cameras 'v2 0'.focal_x: is missing; must be a number"),
+    (lambda models: models[1]["cameras"]["v2 0"].update(k1="a"), "cameras 'v2 0'.k1: is a; must be a number"),
+    (lambda models: models[1]["shots"]["a.JPG"].update(rotation=[1, 2]), r"shots 'a.JPG'.rotation: is of shape \(2,\)"),
+    (lambda models: models[1]["shots"]["a.JPG"].pop("translation"), "shots 'a.JPG'.translation: is missing"),
+])  # fmt: skip
+def test_mistakes_in_reconstructions(tmp_path, edit, pattern):
+    refused(["opensfm", structure_files.opensfm(tmp_path, edit=edit)], pattern, tmp_path)
