@@ -10,7 +10,9 @@ from helpers.photogrammetry_files import NAMES
 from mi_ring import convert
 from mi_ring.errors import InputError
 from mi_ring.importers.bundler import Bundler
+from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.frames import adapt_all, frames_of, require_frames
+from mi_ring.importers.metashape import Metashape
 from mi_ring.importers.opensfm import OpenSfm
 from mi_ring.importers.visualsfm import VisualSfm
 
@@ -166,3 +168,54 @@ def test_unknown_fields_of_opensfm_are_named_once(tmp_path):
 ])  # fmt: skip
 def test_mistakes_in_reconstructions(tmp_path, edit, pattern):
     refused(["opensfm", structure_files.opensfm(tmp_path, edit=edit)], pattern, tmp_path)
+
+
+# Rigs
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_rigs_of_colmap_are_composed(tmp_path, binary):
+    model = structure_files.colmap_rig(tmp_path)
+    if binary:
+        pycolmap = pytest.importorskip("pycolmap")
+        reconstruction = pycolmap.Reconstruction(str(model))
+        for path in model.iterdir():
+            path.unlink()
+        reconstruction.write_binary(str(model))
+    frames = {frame.said: frame for frame in taken(Colmap(tmp_path, Path()))}
+    agree(
+        [frames[name] for name in structure_files.RIG],
+        structure_files.rig_pixels(),
+        ["1.png", "1.png", "2.png", "2.png"],
+    )
+
+
+def test_a_camera_without_a_pose_in_its_rig(tmp_path):
+    structure_files.colmap_rig(tmp_path, calibrated=False)
+    refused(["colmap", tmp_path], "rigs: camera 2 of rig/right/1.png has no pose in its rig; let", tmp_path)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_rigs_of_metashape_are_composed(tmp_path, scale):
+    source = Metashape(structure_files.metashape_rig(tmp_path, scale), Path())
+    frames = taken(source)
+    for frame in frames:
+        frame.pose[:3, 3] /= scale
+    agree(frames, structure_files.rig_pixels(), ["1.png", "1.png", "2.png", "2.png"])
+    assert [note for note in source.notes if "in units of the chunk, not scaled" in note] == source.notes
+    assert len(source.notes) == (scale != 1)
+
+
+@pytest.mark.parametrize(("old", "new", "pattern"), [
+    ('master_id="2"', 'master_id="9"', "camera 'right/2.png': master_id: is '9'; there is no such <camera>"),
+    ("location>", "place>", "sensor '1': location: is missing; must be 3 numbers"),
+    ('type="frame" master_id="0"', 'type="frame" master_id="1"', "sensor '1': master_id: is '1', but the master of"),
+])  # fmt: skip
+def test_mistakes_in_rigs_of_metashape(tmp_path, old, new, pattern):
+    refused(["metashape", edited(structure_files.metashape_rig(tmp_path), old, new)], pattern, tmp_path)
+
+
+def test_a_camera_of_a_rig_whose_master_has_no_pose(tmp_path):
+    path = edited(structure_files.metashape_rig(tmp_path), 'label="left/2.png"><transform>', 'label="left/2.png"><old>')
+    source = Metashape(edited(path, '</transform></camera><camera id="3"', '</old></camera><camera id="3"'), Path())
+    assert len(taken(source)) == 2 and source.without_pose == {"left/2.png", "right/2.png"}

@@ -140,3 +140,77 @@ def opensfm_pixels(k, kind):
     u, v = own["focal_x"] * x + cx, own["focal_y"] * y + cy
     w, h = SIZES[k]  # normalized coordinates: 1 is the longer side, 0 the middle
     return np.stack([u * max(w, h) + w / 2, v * max(w, h) + h / 2], 1)
+
+
+# Rigs: the second camera of one is turned and shifted against the first
+
+IN_RIG = Rotation.from_euler("xyz", [10, -25, 40], degrees=True).as_matrix(), np.array([0.4, -0.3, 0.2])  #: R, t
+RIG = ["rig/left/1.png", "rig/right/1.png", "rig/left/2.png", "rig/right/2.png"]
+RIG_LENSES = [(62, 52, 70.0, 76.0, 28.5, 27.25), (80, 61, 95.0, 90.0, 41.0, 29.0)]  #: w, h, fx, fy, cx, cy
+
+
+def rig_poses():
+    """World-to-camera, of both cameras in each of two places. R, t of IN_RIG: from the first camera to the second."""
+    R2, t2 = IN_RIG
+    for R, t in list(cameras())[:2]:
+        yield R, t
+        yield R2 @ R, R2 @ t + t2
+
+
+def rig_pixels():
+    for k, (R, t) in enumerate(rig_poses()):
+        _, _, fx, fy, cx, cy = RIG_LENSES[k % 2]
+        X, Y, Z = (POINTS @ R.T + t).T
+        yield np.stack([fx * X / Z + cx, fy * Y / Z + cy], 1)
+
+
+def photographs_of_rig(folder, names=RIG):
+    for k, name in enumerate(names):
+        photographs((folder / name).parent, [(folder / name).name], RIG_LENSES[k % 2][:2])
+
+
+def rigid(R, t):
+    """Quaternion w x y z and translation, as COLMAP writes them."""
+    return text_of([*np.roll(Rotation.from_matrix(R).as_quat(), 1), *t])
+
+
+def colmap_rig(folder, calibrated=True):
+    """A text model of COLMAP 4, by the page on its output format."""
+    photographs_of_rig(folder / "images")
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text(
+        "\n".join(f"{k} PINHOLE {text_of(lens)}".replace(".0 ", " ", 2) for k, lens in enumerate(RIG_LENSES, 1))
+    )
+    (model / "rigs.txt").write_text(f"1 2 CAMERA 1 CAMERA 2 {f'1 {rigid(*IN_RIG)}' if calibrated else 0}\n")
+    frames, images = "", ""
+    for k, (name, (R, t)) in enumerate(zip(RIG, rig_poses()), 1):
+        images += f"{k} {rigid(R, t)} {2 - k % 2} {name}\n\n"
+        if k % 2:
+            frames += f"{k} 1 {rigid(R, t)} 2 CAMERA 1 {k} CAMERA 2 {k + 1}\n"
+    (model / "frames.txt").write_text(frames)
+    (model / "images.txt").write_text(images)
+    (model / "points3D.txt").touch()
+    return model
+
+
+def metashape_rig(folder, scale=1.0):
+    """The second sensor has its pose in the axes of the first one; its cameras have a master and no pose."""
+    R2, t2 = IN_RIG
+    photographs_of_rig(folder / "images", names := [name.replace("rig/", "") for name in RIG])
+    sensors, own = "", ""
+    for k, (w, h, fx, fy, cx, cy) in enumerate(RIG_LENSES):
+        place = f"<rotation>{text_of(R2.T)}</rotation><location>{text_of(-R2.T @ t2)}</location>"
+        sensors += (f'<sensor id="{k}" label="s" type="frame" {"master_id=" + chr(34) + "0" + chr(34) if k else ""}>'
+                    f'<resolution width="{w}" height="{h}"/>{place if k else ""}<calibration type="frame" '
+                    f'class="adjusted"><resolution width="{w}" height="{h}"/><f>{fy}</f><b1>{fx - fy}</b1>'
+                    f"<cx>{cx - w / 2}</cx><cy>{cy - h / 2}</cy></calibration></sensor>")  # fmt: skip
+    for k, (name, (R, t)) in enumerate(zip(names, rig_poses())):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
+        first = f"<transform>{text_of(pose)}</transform>"
+        own += (f'<camera id="{k}" sensor_id="{k % 2}" label="{name}"' + (f' master_id="{k - 1}"/>' if k % 2 else
+                f">{first}</camera>"))  # fmt: skip
+    (folder / "rig.xml").write_text(f'<document version="2.0.0"><chunk><sensors>{sensors}</sensors><cameras>{own}'
+        f"</cameras><transform><scale>{scale}</scale></transform></chunk></document>")  # fmt: skip
+    return folder / "rig.xml"
