@@ -12,8 +12,11 @@ from mi_ring.errors import InputError
 from mi_ring.importers.bundler import Bundler
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.frames import adapt_all, frames_of, require_frames
+from mi_ring.importers.gltf_cameras import GltfCameras
 from mi_ring.importers.metashape import Metashape
 from mi_ring.importers.opensfm import OpenSfm
+from mi_ring.importers.polycam import Polycam
+from mi_ring.importers.record3d import Record3D
 from mi_ring.importers.visualsfm import VisualSfm
 
 
@@ -219,3 +222,118 @@ def test_a_camera_of_a_rig_whose_master_has_no_pose(tmp_path):
     path = edited(structure_files.metashape_rig(tmp_path), 'label="left/2.png"><transform>', 'label="left/2.png"><old>')
     source = Metashape(edited(path, '</transform></camera><camera id="3"', '</old></camera><camera id="3"'), Path())
     assert len(taken(source)) == 2 and source.without_pose == {"left/2.png", "right/2.png"}
+
+
+# Polycam
+
+
+@pytest.mark.parametrize("kind", ["corrected_", ""])
+def test_polycam(tmp_path, kind):
+    structure_files.polycam(tmp_path, kind)
+    (tmp_path / "keyframes" / "cameras").mkdir(exist_ok=True)
+    for src in (tmp_path, tmp_path / "keyframes"):
+        source = Polycam(src, Path())
+        pixels = [structure_files.pinhole_pixels(k, lens) for k, lens in enumerate(structure_files.LENSES)]
+        frames = taken(source)
+        agree(frames, pixels, ["7.jpg", "8.jpg", "9.jpg"])
+        assert {frame.image.parent.name for frame in frames} == {f"{kind}images"}
+        assert ["Polycam has not corrected these cameras" in note for note in source.notes] == [True] * (not kind)
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (list.clear, "corrected_cameras: SRC: found no"),
+    (lambda cameras: cameras[1].pop("t_12"), "8.json: t_12: is missing; must be a number"),
+    (lambda cameras: cameras[1].update(fx="a"), "8.json: fx: is a; must be a number"),
+    (lambda cameras: cameras[1].update(t_00=9), "its pose is no rotation and translation"),
+    (lambda cameras: cameras.__setitem__(1, [1]), "8.json: is no object"),
+])  # fmt: skip
+def test_mistakes_in_polycam(tmp_path, edit, pattern):
+    refused(["polycam", structure_files.polycam(tmp_path, edit=edit)], pattern, tmp_path)
+
+
+def test_unknown_fields_of_polycam_are_named_once(tmp_path):
+    source = Polycam(
+        structure_files.polycam(tmp_path, edit=lambda own: [camera.update(k1=0) for camera in own]), Path()
+    )
+    taken(source)
+    assert source.notes == [f"{tmp_path}/keyframes/corrected_cameras: not used, because unknown: k1"]
+
+
+# Record3D
+
+
+@pytest.mark.parametrize("varying", [False, True])
+def test_record3d(tmp_path, varying):
+    source = Record3D(structure_files.record3d(tmp_path, varying), Path())
+    pixels = [structure_files.pinhole_pixels(k, structure_files.LENSES[varying * k]) for k in range(3)]
+    agree(taken(source), pixels, ["0.jpg", "1.jpg", "2.jpg"])
+    assert not source.notes
+
+
+def test_photographs_of_record3d_may_be_reduced_and_padded(tmp_path):
+    structure_files.record3d(tmp_path, edit=lambda own: own.update(w=124, h=104))
+    for k in range(3):
+        (tmp_path / "rgb" / f"{k}.jpg").rename(tmp_path / "rgb" / f"{k:05}.png")
+    pixels = [structure_files.pinhole_pixels(k, np.array(lens) / 2) for k, lens in enumerate(structure_files.LENSES)]
+    agree(taken(Record3D(tmp_path, Path())), pixels, ["00000.png", "00001.png", "00002.png"])
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (dict.clear, "metadata.json: w, h: "),
+    (lambda own: own.update(poses=3), "poses: found none; must be a list of 7 numbers"),
+    (lambda own: own["poses"].__setitem__(1, [1, 2]), r"poses\[1\]: is of shape \(2,\); must be 7 numbers"),
+    (lambda own: own["poses"].__setitem__(1, [0] * 7), r"poses\[1\]: its quaternion is of length 0; must be 1"),
+    (lambda own: own["perFrameIntrinsicCoeffs"].pop(), r"perFrameIntrinsicCoeffs: is of shape \(2, 4\); must be 3 x 4"),
+    (lambda own: own.update(perFrameIntrinsicCoeffs=None, K=[1]), r"K: is \[1\]; must be 9 numbers"),
+    (lambda own: own.update(perFrameIntrinsicCoeffs=None, K=[70, 0, 28, 0, 76, 27, 0, 0, 1]), "K: is .*by columns"),
+])  # fmt: skip
+def test_mistakes_in_record3d(tmp_path, edit, pattern):
+    refused(["record3d", structure_files.record3d(tmp_path, edit=edit)], pattern, tmp_path)
+
+
+# glTF
+
+
+@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
+@pytest.mark.parametrize("by_camera", [False, True])
+def test_cameras_of_blender(tmp_path, suffix, by_camera):
+    def edit(content):
+        for node in content["nodes"] * by_camera:
+            if "camera" in node:
+                content["cameras"][node["camera"]]["name"] = node["name"].removesuffix("_Orientation")
+                node["name"] = f"object {node['camera']}"
+
+    source = GltfCameras(structure_files.gltf(tmp_path, suffix, edit), Path())
+    frames = sorted(taken(source), key=lambda frame: frame.image)
+    agree(frames, map(structure_files.gltf_pixels, range(3)))
+
+
+def test_a_camera_without_an_aspect_ratio_has_that_of_its_photograph(tmp_path):
+    def edit(content):
+        content["extensionsUsed"] = ["KHR_lights_punctual", "KHR_materials_ior"]
+        for camera in content["cameras"]:
+            del camera["perspective"]["aspectRatio"]
+
+    source = GltfCameras(structure_files.gltf(tmp_path, edit=edit), Path())
+    agree(sorted(taken(source), key=lambda frame: frame.image), map(structure_files.gltf_pixels, range(3)))
+    assert source.notes == [f"{source.src}: not used, because unknown: KHR_lights_punctual"]
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (lambda own: own.update(nodes=[]), "SRC: has no node with a camera"),
+    (lambda own: own["nodes"][0].update(camera=7), r"nodes\[0\].camera: is 7; there is none of this number"),
+    (lambda own: own["nodes"][2].update(children=[0, 9]), r"nodes\[9\]: is 9; there is none of this number"),
+    (lambda own: own["nodes"][2].update(children=[0, 0]), "nodes: some are children of several nodes"),
+    (lambda own: own["nodes"][0].update(rotation=[0, 0, 0, 0]), r"nodes\[0\].rotation: is of length 0; must be 1"),
+    (lambda own: own["nodes"][1].update(matrix=[1, 2]), r"nodes\[1\].matrix: is of shape \(2,\)"),
+    (lambda own: own["nodes"][2].update(scale=[1, 2, 1]), "camera 'b': scale: it and its parents scale axes diff"),
+    (lambda own: own["nodes"][2].update(scale=[-1, 1, 1]), "camera 'b': scale: it and its parents scale axes diff"),
+    (lambda own: own["cameras"][0].update(type="orthographic", perspective=None),
+     "camera 'a': type: is 'orthographic'; must be perspective"),
+    (lambda own: own["cameras"][0]["perspective"].update(yfov=4), "camera 'a': yfov: is 4; must be between 0 and pi"),
+    (lambda own: own["cameras"][0]["perspective"].update(yfov=None), "camera 'a': yfov: is missing"),
+    (lambda own: own["cameras"][0]["perspective"].update(aspectRatio=2),
+     "camera 'a': aspectRatio: is 2, but a.JPG has 62 x 52 pixels"),
+])  # fmt: skip
+def test_mistakes_in_gltf(tmp_path, edit, pattern):
+    refused(["gltf", structure_files.gltf(tmp_path, edit=edit)], pattern, tmp_path)

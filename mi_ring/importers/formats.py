@@ -10,14 +10,17 @@ from mi_ring.importers.bundler import Bundler
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.diligent_mv import DiligentMV
 from mi_ring.importers.frames import Source
+from mi_ring.importers.gltf_cameras import GltfCameras
 from mi_ring.importers.iron import Iron
 from mi_ring.importers.llff import Llff
 from mi_ring.importers.metashape import Metashape, find_chunk
 from mi_ring.importers.middlebury import Middlebury
 from mi_ring.importers.neus import Neus
 from mi_ring.importers.opensfm import OpenSfm
+from mi_ring.importers.polycam import Polycam
 from mi_ring.importers.reading import list_images, load_json, load_xml
 from mi_ring.importers.realitycapture import POSE, RealityCapture, read_csv, xmp_fields
+from mi_ring.importers.record3d import Record3D
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
 from mi_ring.importers.visualsfm import VisualSfm
@@ -26,7 +29,7 @@ FORMATS = {
     "diligent-mv": DiligentMV, "transforms": Transforms, "colmap": Colmap, "neus": Neus, "iron": Iron,
     "metashape": Metashape, "realitycapture": RealityCapture, "sfmdata": SfmData, "llff": Llff,
     "middlebury": Middlebury, "bundler": Bundler, "visualsfm": VisualSfm,
-    "opensfm": OpenSfm,
+    "opensfm": OpenSfm, "polycam": Polycam, "record3d": Record3D, "gltf": GltfCameras,
 }  # fmt: skip
 
 

@@ -214,3 +214,106 @@ def metashape_rig(folder, scale=1.0):
     (folder / "rig.xml").write_text(f'<document version="2.0.0"><chunk><sensors>{sensors}</sensors><cameras>{own}'
         f"</cameras><transform><scale>{scale}</scale></transform></chunk></document>")  # fmt: skip
     return folder / "rig.xml"
+
+
+# Phones: lenses are fx, fy, cx, cy
+
+LENSES = [(70.0, 76.0, 28.5, 27.25), (95.0, 90.0, 27.0, 43.5), (81.5, 88.0, 42.5, 29.0)]
+
+
+def pinhole_pixels(k, lens):
+    fx, fy, cx, cy = lens
+    X, Y, Z = seen(k).T
+    return np.stack([fx * X / Z + cx, fy * Y / Z + cy], 1)
+
+
+def opengl_pose(R, t):
+    """Camera to world; the camera looks along -z, y is up."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R.T @ FLIP, -R.T @ t
+    return pose
+
+
+def polycam(folder, kind="corrected_", edit=lambda cameras: None):
+    given = []
+    for (w, h), (fx, fy, cx, cy), (R, t) in zip(SIZES, LENSES, cameras()):
+        given.append({f"t_{i}{j}": opengl_pose(R, t)[i, j] for i in range(3) for j in range(4)})
+        given[-1] |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": w, "height": h, "blur_score": 9.5,
+                      "timestamp": 123, "neighbors": [1], "manual_keyframe": False}  # fmt: skip
+    edit(given)
+    (folder / "keyframes" / f"{kind}cameras").mkdir(parents=True)
+    for k, own in enumerate(given):
+        (folder / "keyframes" / f"{kind}cameras" / f"{k + 7}.json").write_text(json.dumps(own))
+    photographs_of_sizes(folder / "keyframes" / f"{kind}images", ["7.jpg", "8.jpg", "9.jpg"])
+    photographs(folder / "keyframes" / "images", ["7.jpg"])
+    return folder
+
+
+def record3d(folder, varying=True, edit=lambda metadata: None):
+    """Quaternions x y z w; K by columns. Photographs have one size, and three or one lens."""
+    fx, fy, cx, cy = LENSES[0]
+    metadata = {"w": 62, "h": 52, "dw": 192, "dh": 256, "fps": 60, "initPose": [0, 0, 0, 1, 0, 0, 0],
+                "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "poses": []}  # fmt: skip
+    if varying:
+        metadata["perFrameIntrinsicCoeffs"] = [list(lens) for lens in LENSES]
+    for R, t in cameras():
+        pose = opengl_pose(R, t)
+        metadata["poses"].append([*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]])
+    edit(metadata)
+    photographs(folder / "rgb", ["0.jpg", "1.jpg", "2.jpg"])
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    return folder
+
+
+# glTF: fields of view and aspect ratios of cameras, in a hierarchy
+
+FOVS = [0.7, 1.1, 0.9]
+
+
+def gltf(folder, suffix=".gltf", edit=lambda content: None):
+    """One camera has a matrix, one a scaled and turned parent, one a child of its object with its name and more."""
+    (pose, inner, child) = (opengl_pose(R, t) for R, t in cameras())
+    names = [name.rsplit(".", 1)[0] for name in NAMES]
+    parent = np.eye(4)
+    parent[:3, :3] = 2.5 * Rotation.from_euler("xyz", [10, -25, 40], degrees=True).as_matrix()
+    parent[:3, 3] = [3, -1, 8]
+    inner = np.linalg.inv(parent) @ inner @ np.diag([2.5, 2.5, 2.5, 1])
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", -90, degrees=True).as_matrix()
+
+    def parts(place, scale=1.0):
+        rotation = place[:3, :3] / np.cbrt(np.linalg.det(place[:3, :3]))
+        return {"translation": place[:3, 3].tolist(), "rotation": Rotation.from_matrix(rotation).as_quat().tolist(),
+                "scale": [scale] * 3}  # fmt: skip
+
+    content = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [1, 2, 3]}],
+        "cameras": [{"type": "perspective", "name": f"camera {k}", "perspective": {
+            "yfov": fov, "aspectRatio": w / h, "znear": 0.1, "zfar": 9.0}} for k, (fov, (w, h)) in
+            enumerate(zip(FOVS, SIZES))],
+        "nodes": [
+            {"name": names[1], "camera": 1, **parts(inner)},
+            {"name": names[0], "camera": 0, "matrix": pose.T.ravel().tolist()},
+            {"name": "rig", "children": [0], **parts(parent, 2.5)},
+            {"name": names[2], "children": [4], **parts(child @ np.linalg.inv(turn))},
+            {"name": f"{names[2]}_Orientation", "camera": 2, "rotation": parts(turn)["rotation"]},
+        ],
+    }  # fmt: skip
+    edit(content)
+    photographs_of_sizes(folder)
+    path = folder / f"cameras{suffix}"
+    text = json.dumps(content).encode()
+    if suffix == ".glb":
+        text += b" " * (-len(text) % 4)
+        text = b"glTF" + np.array([2, 20 + len(text), len(text)], "<u4").tobytes() + b"JSON" + text
+    path.write_bytes(text)
+    return path
+
+
+def gltf_pixels(k):
+    """The projection matrix of the specification, section 3.10.3.3, and a viewport of the photograph's size."""
+    w, h = SIZES[k]
+    X, Y, Z = (seen(k) @ FLIP).T
+    x = X / (w / h * np.tan(0.5 * FOVS[k])) / -Z
+    y = Y / np.tan(0.5 * FOVS[k]) / -Z
+    return np.stack([(x + 1) / 2 * w, (1 - y) / 2 * h], 1)
