@@ -201,11 +201,19 @@ def test_the_dinosaur_of_middlebury_fills_the_box_of_its_readme(shared):
 def test_meshroom(tmp_path, version, own, terms):
     source = SfmData(alicevision(tmp_path, version, own), Path())
     frames = taken(source)
-    assert source.without_pose == {"lost.png"}
+    assert source.without_pose == {"lost.png"} and not source.notes
     focal = (FX, FX) if version == "1.0.0" else (FX, FY)
     for frame, (R, t) in zip(frames, cameras(), strict=True):
         pixels = by_opencv(R, t, focal, np.array(SIZE) / 2 + OFFSET, terms, own.get("type") == "fisheye4")
         np.testing.assert_allclose(landed(frame), pixels + 0.5, atol=1e-3)
+
+
+def test_meshrooms_poses_without_a_position_and_unknown_fields(tmp_path):
+    path = alicevision(tmp_path, own={"shear": 0.1, "bend": 2})
+    path.write_text(path.read_text().replace('"rotationOnly": "False"', '"rotationOnly": "True"', 1))
+    source = SfmData(path, Path())
+    assert len(taken(source)) == 2 and source.without_pose == {"a.JPG", "lost.png"}
+    assert source.notes == [f"{path}: not used, because unknown: shear, bend"]
 
 
 @pytest.mark.parametrize(("kinds", "nested"), [

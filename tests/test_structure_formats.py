@@ -4,13 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import structure_files
+from helpers import foreign_captures, photogrammetry_files, structure_files
 from helpers.photogrammetry_files import NAMES
+from PIL import Image
 
 from mi_ring import convert
 from mi_ring.errors import InputError
 from mi_ring.importers.bundler import Bundler
 from mi_ring.importers.colmap import Colmap
+from mi_ring.importers.formats import FORMATS, detect, guess
 from mi_ring.importers.frames import adapt_all, frames_of, require_frames
 from mi_ring.importers.gltf_cameras import GltfCameras
 from mi_ring.importers.metashape import Metashape
@@ -337,3 +339,106 @@ def test_a_camera_without_an_aspect_ratio_has_that_of_its_photograph(tmp_path):
 ])  # fmt: skip
 def test_mistakes_in_gltf(tmp_path, edit, pattern):
     refused(["gltf", structure_files.gltf(tmp_path, edit=edit)], pattern, tmp_path)
+
+
+# Photographs that are not as their cameras
+
+
+SIZED = {
+    "opensfm": lambda: [structure_files.opensfm_pixels(k, kind)
+                        for k, kind in enumerate(("perspective", "brown", "fisheye_opencv"))],
+    "polycam": lambda: [structure_files.pinhole_pixels(k, lens) for k, lens in enumerate(structure_files.LENSES)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SIZED)
+def test_reduced_photographs(tmp_path, name):
+    NEW[name][0](tmp_path)
+    source = FORMATS[name](tmp_path, Path())
+    expected = []
+    for frame, pixels in zip(frames_of(source), SIZED[name]()):
+        picture = Image.open(frame.image)
+        small = [-(-side // 2) for side in picture.size]
+        expected.append(pixels * small / picture.size)
+        picture.resize(small).save(frame.image)
+    frames = taken(FORMATS[name](tmp_path, Path()))
+    agree(frames, expected, [frame.image.name for frame in frames])
+
+
+@pytest.mark.parametrize("name", SIZED)
+def test_photographs_that_exif_turns(tmp_path, name):
+    NEW[name][0](tmp_path)
+    source = FORMATS[name](tmp_path, Path())
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for frame in frames_of(source):
+        picture = Image.open(frame.image)
+        picture.transpose(Image.Transpose.ROTATE_90).save(frame.image, exif=exif)
+    frames = taken(FORMATS[name](tmp_path, Path()))
+    agree(frames, SIZED[name](), [frame.image.name for frame in frames])
+    assert [frame.orientation for frame in frames] == [6, 6, 6]
+
+
+# Without a format
+
+NEW = {
+    "bundler": (structure_files.bundler, "bundle/bundle.out"), "visualsfm": (structure_files.visualsfm, "model.nvm"),
+    "opensfm": (structure_files.opensfm, "opensfm/reconstruction.json"), "polycam": (structure_files.polycam, ""),
+    "record3d": (structure_files.record3d, ""), "gltf": (structure_files.gltf, "cameras.gltf"),
+}  # fmt: skip
+OTHERS = {
+    "colmap": (structure_files.colmap_rig, ""), "metashape": (photogrammetry_files.metashape, "cameras.xml"),
+    "realitycapture": (photogrammetry_files.csv_table, "cameras.csv"), "llff": (photogrammetry_files.llff, ""),
+    "middlebury": (photogrammetry_files.middlebury, "pot_par.txt"),
+    "sfmdata": (photogrammetry_files.alicevision, "cameras.sfm"), "neus": (foreign_captures.neus, ""),
+    "iron": (foreign_captures.iron, ""),
+    "transforms": (lambda folder: foreign_captures.transforms(folder, {}, [], None), "transforms.json"),
+    "diligent-mv": (lambda folder: foreign_captures.diligent_folder(folder).parent / "bearPNG", ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_format_is_guessed_from_the_folder_or_the_file(tmp_path, name):
+    write, src = (NEW | OTHERS)[name]
+    write(tmp_path)
+    folder = tmp_path / "bearPNG" if name == "diligent-mv" else tmp_path
+    assert guess(folder) == (name, folder / src)
+    if src:
+        assert guess(folder / src) == (name, folder / src)
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_convert_needs_no_format(tmp_path, capsys, name):
+    write, src = NEW[name]
+    write(tmp_path / "scan")
+    convert.main([str(tmp_path / "scan"), str(tmp_path / "made.xml"), "--flash-offset", "1", "2", "3"])
+    assert capsys.readouterr().out.startswith(f"{tmp_path / 'scan' / src}: taken for {name}\n")
+    assert (tmp_path / "made.xml").is_file()
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_cameras_beside_photographs_are_detected(tmp_path, name):
+    write, _ = NEW[name]
+    write(tmp_path)
+    assert type(detect(tmp_path)) is FORMATS[name]
+
+
+def test_what_may_be_several_formats_or_none_is_one_line(tmp_path):
+    refused([tmp_path], "SRC: found no cameras; looked for a model of COLMAP, transforms.json, ", tmp_path)
+    refused([tmp_path / "gone"], "FORMAT: is .*gone; must be one of .*, or SRC, a file or folder", tmp_path)
+    structure_files.visualsfm(tmp_path)
+    (tmp_path / "list.txt").touch()
+    refused([tmp_path / "list.txt"], "list.txt: SRC: found no cameras", tmp_path)
+    (tmp_path / "model.nvm").rename(tmp_path / "b.nvm")
+    structure_files.visualsfm(tmp_path)
+    structure_files.gltf(tmp_path)
+    pattern = (
+        "may be of 3 kinds; give one of these instead: visualsfm .*/b.nvm, visualsfm .*/model.nvm, gltf .*/cameras"
+    )
+    refused([tmp_path], pattern, tmp_path)
+
+
+def test_damaged_files_are_not_taken_for_cameras(tmp_path):
+    for name in ("bundle.out", "a.nvm", "reconstruction.json", "metadata.json", "a.glb", "a.gltf", "a.sfm", "a.xml"):
+        (tmp_path / name).write_bytes(b"[3, 4]")
+    refused([tmp_path], "SRC: found no cameras", tmp_path)
