@@ -1,4 +1,4 @@
-"""Import photographs with cameras from other tools: `python -m mi_ring.convert [FORMAT] SRC SCENE.xml`."""
+"""Import photographs with cameras from other tools: `python -m mi_ring.convert FORMAT SRC SCENE.xml`."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,10 @@
-"""Bundler's cameras, which other programs write too."""
+"""Bundler's cameras, which other programs write too.
+
+Fields:
+
+- used: f, k1, k2 (a camera with f = 0 has no pose); R, t (world to camera, which looks along -z, y up)
+- harmless: points; focal lengths in list.txt, where the program began
+"""
 
 import re
 from collections.abc import Iterator
@@ -26,13 +32,6 @@ class Bundler(Photogrammetry):
     SRC is the file, or a folder with bundle.out or bundle/bundle.out. The photographs are named in list.txt, or of
     pot.bundle.out in pot.list.txt, beside SRC or above it. The file gives no sizes: the photographs must have their
     original size.
-
-    | field | |
-    |---|---|
-    | f, k1, k2 | used; a camera with f = 0 has no pose |
-    | R, t | used: world to camera; the camera looks along -z, y is up |
-    | points | harmless |
-    | focal length in list.txt | harmless: where the program began |
     """
 
     @property

@@ -1,4 +1,12 @@
-"""Cameras in glTF files, as Blender exports them."""
+"""Cameras in glTF files, as Blender exports them.
+
+Fields:
+
+- used: name, camera, children, matrix, translation, rotation and scale of nodes; name, yfov and aspectRatio of cameras
+- refused: orthographic cameras
+- noted: extensions of lights; the light is where the options say
+- harmless: znear and zfar of cameras; meshes, materials, textures, animations
+"""
 
 import math
 from collections.abc import Iterator
@@ -26,14 +34,6 @@ class GltfCameras(Photogrammetry):
 
     SRC is the .gltf or .glb. A photograph has the name of its camera's object, or of its camera. glTF has neither lens
     distortion nor a shift of the lens: the principal point is in the middle.
-
-    | field | |
-    |---|---|
-    | nodes: name, camera, children, matrix, translation, rotation, scale | used |
-    | cameras: name, yfov, aspectRatio | used |
-    | cameras: orthographic | refused |
-    | cameras: znear, zfar; meshes, materials, textures, animations | harmless |
-    | extensions: lights | noted; the light is where the options say |
     """
 
     def posed(self) -> Iterator[Frame]:

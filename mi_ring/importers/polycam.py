@@ -29,7 +29,7 @@ class Polycam(Photogrammetry):
 
     @property
     def corrected(self) -> str:
-        """What the names of the folders begin with: "corrected_", or nothing."""
+        """What the names of the folders begin with: `corrected_`, or nothing."""
         return "corrected_" if (self.keyframes / "corrected_cameras").is_dir() else ""
 
     @property

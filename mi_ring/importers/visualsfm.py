@@ -1,4 +1,11 @@
-"""VisualSFM's models."""
+"""VisualSFM's models.
+
+Fields:
+
+- used: file name (a double quote stands for a space); focal length, quaternion w x y z, centre, radial distortion;
+  FixedK fx cx fy cy in line 1 (without it, the principal point is in the middle)
+- harmless: points, PLY files
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,13 +33,6 @@ class VisualSfm(Photogrammetry):
 
     SRC is the file. Of several models the one with the most photographs is taken. The file gives no sizes: the
     photographs must have their original size.
-
-    | field | |
-    |---|---|
-    | file name | used; a double quote stands for a space |
-    | focal length, quaternion w x y z, centre, radial distortion | used |
-    | FixedK fx cx fy cy in line 1 | used; without it, the principal point is in the middle |
-    | points, PLY files | harmless |
     """
 
     def posed(self) -> Iterator[Frame]:
