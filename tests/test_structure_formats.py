@@ -421,6 +421,9 @@ def test_cameras_beside_photographs_are_detected(tmp_path, name):
     write, _ = NEW[name]
     write(tmp_path)
     assert type(detect(tmp_path)) is FORMATS[name]
+    folder = taken(FORMATS[name](guess(tmp_path)[1], Path()))[0].image.parent
+    assert type(source := detect(folder)) is FORMATS[name]
+    assert {frame.image.parent for frame in taken(source)} == {folder} and len(taken(source)) == 3
 
 
 def test_what_may_be_several_formats_or_none_is_one_line(tmp_path):

@@ -57,6 +57,12 @@ def has_sidecars(folder: Path) -> bool:
     return any(accepts(lambda path: "Rotation" in xmp_fields(load_xml(path)), file) for file in folder.glob("*.xmp"))
 
 
+def has_keyframes(folder: Path) -> bool:
+    """Has a folder, or its folder keyframes, a camera of Polycam?"""
+    cameras = (next(place.glob("*cameras/[!.]*.json"), None) for place in (folder, folder / "keyframes"))
+    return any(isinstance(own := load_json(path), dict) and "t_00" in own for path in cameras if path)
+
+
 def begins(path: Path, word: bytes) -> bool:
     """Does a file begin with a word?"""
     with path.open("rb") as file:
@@ -80,7 +86,7 @@ SIGNS = (
     Sign("visualsfm", "*.nvm", ("*.nvm",), lambda path: begins(path, b"NVM_V3")),
     Sign("opensfm", "reconstruction.json", ("reconstruction.json", "opensfm/reconstruction.json"),
          lambda path: isinstance(top := load_json(path), list) and isinstance(top[0], dict) and "shots" in top[0]),
-    Sign("polycam", "keyframes of Polycam", (), lambda path: any((path / "keyframes").glob("*cameras/*.json"))),
+    Sign("polycam", "keyframes of Polycam", (), has_keyframes),
     Sign("record3d", "metadata.json of Record3D", (), lambda path: has("poses")(path / "metadata.json")),
     Sign("gltf", "*.glb or *.gltf with cameras", ("*.glb", "*.gltf"), has_cameras),
     Sign("neus", "cameras_sphere.npz", (), has_files("cameras_sphere.npz", "cameras.npz")),
@@ -127,7 +133,7 @@ def guess(src: Path) -> tuple[str, Path]:
         choices = ", ".join(f"{name} {path}" for name, path in found[:5])
         raise InputError(f"{src}: SRC: may be of {len(found)} kinds; give one of these instead: {choices}")
     looked = ", ".join(sign.what for sign in SIGNS if sign.what)
-    raise InputError(f"{src}: SRC: found no cameras; looked for {looked}; if there are some, give their format first")
+    raise InputError(f"{src}: SRC: found no cameras; looked for {looked}; name the format before SRC if there are some")
 
 
 def accepts(check: Callable[[Path], Any], path: Path) -> bool:
