@@ -25,7 +25,7 @@ pycolmap.Reconstruction(sys.argv[1])
 
 @dataclass(frozen=True)
 class Colmap(Photogrammetry):
-    """COLMAP, text or binary. The light is beside the camera.
+    """COLMAP, text or binary, with rigs or without. The light is beside the camera.
 
     SRC is the folder of the model (cameras, images), or a folder with models in sparse/0, sparse/1, … or sparse. Of
     several the one with the most photographs is taken.
@@ -74,7 +74,11 @@ class Colmap(Photogrammetry):
                 continue
             if (path := self.photograph(name, str(model))) is None:
                 continue
-            world_to_camera = image.cam_from_world().matrix()
+            try:
+                world_to_camera = image.cam_from_world().matrix()  # of the frame and of the sensor in its rig
+            except RuntimeError as error:
+                raise InputError(f"{model}: rigs: camera {image.camera_id} of {name} has no pose in its rig; let "
+                                 "COLMAP estimate it") from error  # fmt: skip
             pose = camera_to_world(world_to_camera[:, :3], world_to_camera[:, 3])
             camera = reconstruction.cameras[image.camera_id]
             lens = Lens(camera.model_name, (camera.width, camera.height), camera.params)

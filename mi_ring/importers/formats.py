@@ -1,69 +1,144 @@
-"""All formats, by their names in `mi_ring.convert`, and the detection of a folder's format."""
+"""All formats, by their names in `mi_ring.convert`, and how they are recognised."""
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mi_ring.errors import InputError
+from mi_ring.importers.bundler import FIRST_LINE, Bundler
 from mi_ring.importers.colmap import Colmap
 from mi_ring.importers.diligent_mv import DiligentMV
 from mi_ring.importers.frames import Source
+from mi_ring.importers.gltf_cameras import GltfCameras, has_cameras
 from mi_ring.importers.iron import Iron
 from mi_ring.importers.llff import Llff
 from mi_ring.importers.metashape import Metashape, find_chunk
 from mi_ring.importers.middlebury import Middlebury
 from mi_ring.importers.neus import Neus
+from mi_ring.importers.opensfm import OpenSfm
+from mi_ring.importers.photogrammetry import Photogrammetry
+from mi_ring.importers.polycam import Polycam
 from mi_ring.importers.reading import list_images, load_json, load_xml
 from mi_ring.importers.realitycapture import POSE, RealityCapture, read_csv, xmp_fields
+from mi_ring.importers.record3d import Record3D
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
+from mi_ring.importers.visualsfm import VisualSfm
 
-FORMATS = {
+FORMATS: dict[str, type[Source]] = {
     "diligent-mv": DiligentMV, "transforms": Transforms, "colmap": Colmap, "neus": Neus, "iron": Iron,
     "metashape": Metashape, "realitycapture": RealityCapture, "sfmdata": SfmData, "llff": Llff,
-    "middlebury": Middlebury,
+    "middlebury": Middlebury, "bundler": Bundler, "visualsfm": VisualSfm,
+    "opensfm": OpenSfm, "polycam": Polycam, "record3d": Record3D, "gltf": GltfCameras,
 }  # fmt: skip
+
+
+class Sign(NamedTuple):
+    """How cameras of a format are recognised."""
+
+    format: str  #: its name
+    what: str  #: for the user
+    files: tuple[str, ...]  #: patterns of the files in a folder that may be SRC; empty: the folder itself may be
+    check: Callable[[Path], Any]  #: is this file, or folder, of the format?
+
+
+def has(*fields: str) -> Callable[[Path], bool]:
+    """Is a file JSON whose object has something in one of these fields?"""
+    return lambda path: isinstance(top := load_json(path), dict) and any(top.get(field) for field in fields)
+
+
+def has_files(*names: str) -> Callable[[Path], bool]:
+    """Has a folder one of these files?"""
+    return lambda path: any((path / name).is_file() for name in names)
+
+
+def has_sidecars(folder: Path) -> bool:
+    """Has a folder an XMP sidecar with a pose?"""
+    return any(accepts(lambda path: "Rotation" in xmp_fields(load_xml(path)), file) for file in folder.glob("*.xmp"))
+
+
+def has_keyframes(folder: Path) -> bool:
+    """Has a folder, or its folder keyframes, a camera of Polycam?"""
+    cameras = (next(place.glob("*cameras/[!.]*.json"), None) for place in (folder, folder / "keyframes"))
+    return any(isinstance(own := load_json(path), dict) and "t_00" in own for path in cameras if path)
+
+
+def begins(path: Path, word: bytes) -> bool:
+    """Does a file begin with a word?"""
+    with path.open("rb") as file:
+        return file.read(len(word)) == word
+
+
+#: In the order in which `detect` takes them.
+SIGNS = (
+    Sign("colmap", "a model of COLMAP", (), Colmap.model),
+    Sign("transforms", "transforms.json", ("transforms.json", "transforms_train.json"),
+         lambda path: path.stem in ("transforms", "transforms_train") or has("frames")(path)),
+    Sign("metashape", "*.xml of Metashape", ("*.xml",), lambda path: find_chunk(load_xml(path)) is not None),
+    Sign("realitycapture", "*.xmp or *.csv of RealityCapture", (), has_sidecars),
+    Sign("realitycapture", "", ("*.csv",), lambda path: {"name", *POSE, "f"} <= {*read_csv(path)[0]}),
+    Sign("llff", "poses_bounds.npy", (), has_files("poses_bounds.npy")),
+    Sign("middlebury", "*_par.txt", ("*_par.txt",), lambda path: path.name.endswith("_par.txt")),
+    Sign("sfmdata", "*.sfm or sfm_data.json", ("cameras.sfm", "sfm.json", "sfm_data.json", "*.sfm"),
+         has("poses", "extrinsics")),
+    Sign("bundler", "bundle.out", ("bundle.out", "bundle/bundle.out", "*.bundle.out", "bundle.rd.out"),
+         lambda path: begins(path, FIRST_LINE.encode())),
+    Sign("visualsfm", "*.nvm", ("*.nvm",), lambda path: begins(path, b"NVM_V3")),
+    Sign("opensfm", "reconstruction.json", ("reconstruction.json", "opensfm/reconstruction.json"),
+         lambda path: isinstance(top := load_json(path), list) and isinstance(top[0], dict) and "shots" in top[0]),
+    Sign("polycam", "keyframes of Polycam", (), has_keyframes),
+    Sign("record3d", "metadata.json of Record3D", (), lambda path: has("poses")(path / "metadata.json")),
+    Sign("gltf", "*.glb or *.gltf with cameras", ("*.glb", "*.gltf"), has_cameras),
+    Sign("neus", "cameras_sphere.npz", (), has_files("cameras_sphere.npz", "cameras.npz")),
+    Sign("iron", "cam_dict_norm.json", (), has_files("cam_dict_norm.json", "train/cam_dict_norm.json")),
+    Sign("diligent-mv", "Calib_Results.mat", (), has_files("Calib_Results.mat")),
+)  # fmt: skip
+
+
+def signs_in(place: Path) -> Iterator[tuple[str, Path]]:
+    """The formats of the cameras in a folder, or of a file, with what is SRC of each."""
+    for sign in SIGNS:
+        if not place.is_dir():
+            paths = [place] if place.suffix.lower() in {Path(name).suffix for name in sign.files} else []
+        else:
+            paths = [place]
+            if sign.files:
+                paths = [*dict.fromkeys(path for name in sign.files for path in sorted(place.glob(name)))]
+        yield from ((sign.format, path) for path in paths if accepts(sign.check, path))
 
 
 def detect(folder: Path) -> Source | None:
     """The importer of the cameras in a folder of photographs, otherwise in its parent folder; None without cameras.
 
-    The first match is taken, in this order: COLMAP's model (also in sparse/0, sparse), transforms.json, Metashape's
-    XML, RealityCapture's sidecars, its table, poses_bounds.npy, Middlebury's `*_par.txt`, cameras.sfm, sfm.json,
-    sfm_data.json, other `*.sfm` with poses. Files of one kind are sorted by name. The photographs are those in `folder`
-    if there are any, except that transforms.json names its own.
+    The first of `SIGNS` is taken; of several files, the first by name. Formats whose photographs are not ordinary ones
+    are left out. The photographs are those in `folder` if there are any, except that transforms.json names its own.
     """
     images = folder if list_images(folder) else None
-
-    def has_pose(path: Path) -> bool:
-        return "Rotation" in xmp_fields(load_xml(path))
-
-    def has_poses(path: Path) -> bool:
-        return isinstance(top := load_json(path), dict) and bool(top.get("poses") or top.get("extrinsics"))
-
     for place in (folder, folder.absolute().parent):
-        scenes = [place / name for name in ("cameras.sfm", "sfm.json", "sfm_data.json")]
-        candidates: list[tuple[type[Source], list[Path], Callable[[Path], Any]]] = [
-            (Colmap, [place], Colmap.model),
-            (Transforms, [place / "transforms.json"], Path.is_file),
-            (Metashape, sorted(place.glob("*.xml")), lambda path: find_chunk(load_xml(path)) is not None),
-            (RealityCapture, [place], lambda path: any(accepts(has_pose, file) for file in path.glob("*.xmp"))),
-            (RealityCapture, sorted(place.glob("*.csv")), lambda path: {"name", *POSE, "f"} <= {*read_csv(path)[0]}),
-            (Llff, [place], lambda path: (path / "poses_bounds.npy").is_file()),
-            (Middlebury, sorted(place.glob("*_par.txt")), Path.exists),
-            (SfmData, [*scenes, *sorted(place.glob("*.sfm"))], has_poses),
-        ]
-        for importer, paths, check in candidates:
-            for path in filter(partial(accepts, check), paths):
-                options: dict[str, Any] = {} if importer is Transforms else {"images": images}
-                return importer(path, place / "scene.xml", **options)
+        for name, path in signs_in(place):
+            importer = FORMATS[name]
+            if importer is Transforms:
+                return Transforms(path, place / "scene.xml")
+            if issubclass(importer, Photogrammetry):
+                return importer(path, place / "scene.xml", images=images)
     return None
 
 
+def guess(src: Path) -> tuple[str, Path]:
+    """The format of a file or folder, and what is SRC of it. Raises InputError if there is none, or several."""
+    found = [*dict.fromkeys(signs_in(src))]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        choices = ", ".join(f"{name} {path}" for name, path in found[:5])
+        raise InputError(f"{src}: SRC: may be of {len(found)} kinds; give one of these instead: {choices}")
+    looked = ", ".join(sign.what for sign in SIGNS if sign.what)
+    raise InputError(f"{src}: SRC: found no cameras; looked for {looked}; name the format before SRC if there are some")
+
+
 def accepts(check: Callable[[Path], Any], path: Path) -> bool:
-    """Does a file pass a check? It does not if reading it raises InputError."""
+    """Does a file pass a check? It does not if it cannot be read."""
     try:
         return bool(check(path))
-    except InputError:
+    except (InputError, OSError, LookupError):
         return False

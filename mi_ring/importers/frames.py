@@ -1,7 +1,7 @@
 """Frames, the output of all importers: photographs with their cameras and lights."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -85,6 +85,11 @@ class Source:
     def notes(self) -> list[str]:
         """Sentences for the user about what was chosen or not used. Complete when all `frames` have been read."""
         return []
+
+    def note_unknown(self, path: Path, fields: Iterable[str]) -> None:
+        """Note the fields of a file that are neither used nor known to be harmless; each is named once."""
+        if names := ", ".join(dict.fromkeys(" ".join(name.split())[:40] for name in fields)):
+            self.notes.append(f"{path}: not used, because unknown: {names}")
 
     @property
     def folder(self) -> Path:

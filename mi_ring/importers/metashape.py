@@ -22,7 +22,7 @@ class Metashape(Photogrammetry):
     """Metashape: File > Export > Export Cameras as Agisoft XML. The light is beside the camera.
 
     SRC is the XML file. Photographs are found by the labels of the cameras, with any suffix. Disabled cameras have no
-    pose.
+    pose. A camera of a rig has the pose of its master, moved by location and rotation of its sensor.
     """
 
     def posed(self) -> Iterator[Frame]:
@@ -32,25 +32,31 @@ class Metashape(Photogrammetry):
                              "Cameras of Metashape writes as Agisoft XML")  # fmt: skip
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
         components = {component.get("id"): component for component in chunk.iterfind("components/component")}
+        cameras = {camera.get("id"): camera for camera in chunk.iterfind("cameras//camera")}
         for camera in chunk.iterfind("cameras//camera"):
             label = camera.get("label")
             what = f"{self.src}: camera {(label or camera.get('id'))!r}"
             if not label:
                 raise InputError(f"{what}: label: is missing; must be the name of a photograph")
-            if camera.get("master_id") not in (None, camera.get("id")):
-                raise InputError(f"{what}: master_id: is {camera.get('master_id')!r}, of a rig, which is not supported"
-                                 "; export the cameras as COLMAP or Bundler, where each has its own pose")  # fmt: skip
-            if camera.find("transform") is None or camera.get("enabled") in ("0", "false"):
+            master = cameras.get(camera.get("master_id", camera.get("id")))
+            if master is None:
+                raise InputError(f"{what}: master_id: is {camera.get('master_id')!r}; there is no such <camera>")
+            if master.find("transform") is None or camera.get("enabled") in ("0", "false"):
                 self.without_pose.add(label)
                 continue
             sensor = sensors.get(camera.get("sensor_id"))
             if sensor is None:
                 raise InputError(f"{what}: sensor_id: is {camera.get('sensor_id')!r}; there is no such <sensor>")
-            pose = numbers(camera, "transform", (4, 4), what)
+            pose = numbers(master, "transform", (4, 4), what)
+            if master is not camera:
+                pose = pose @ in_rig(sensor, master, f"{self.src}: sensor {sensor.get('id')!r}")
             # Old versions write no components, new ones no transform of the chunk.
-            component = components.get(camera.get("component_id"))
+            component = components.get(master.get("component_id"))
             transform = first_child("transform", component, chunk)
             if transform is not None:
+                if master is not camera and numbers(transform, "scale", (1,), what, np.ones(1))[0] != 1:
+                    note = f"{self.src}: sensors: their places in rigs are taken in units of the chunk, not scaled"
+                    self.notes.extend({note} - {*self.notes})
                 pose = in_world(pose, transform, f"{self.src}: transform")
             if image := self.photograph(label, what):
                 lens = lens_of(sensor, f"{self.src}: sensor {sensor.get('id')!r}")
@@ -87,6 +93,21 @@ def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.
     if scale <= 0:
         raise InputError(f"{what}: scale: is {scale}; must be above 0")
     return moved_pose(pose, scale, rotation, shift)
+
+
+def in_rig(sensor: ElementTree.Element, master: ElementTree.Element, what: str) -> np.ndarray:
+    """The pose (4, 4) of a sensor of a rig in the axes of its master sensor.
+
+    Raises InputError, which begins with `what`, if it is missing, or relative to the sensor of another camera than
+    `master`.
+    """
+    if sensor.get("master_id") != master.get("sensor_id"):
+        raise InputError(f"{what}: master_id: is {sensor.get('master_id')!r}, but the master of its camera has sensor "
+                         f"{master.get('sensor_id')!r}; export the cameras as COLMAP or Bundler")  # fmt: skip
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = (numbers(sensor, name, shape, what)
+                                 for name, shape in (("rotation", (3, 3)), ("location", (3,))))  # fmt: skip
+    return pose
 
 
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:

@@ -64,6 +64,15 @@ class NamedPhotographs(Source):
             self.without_photograph.append(path)
         return found
 
+    def largest(self, models: Sequence[Sized], what: str) -> int:
+        """The index of the model with the most photographs; a note says which others are not used."""
+        sizes = [len(model) for model in models]
+        best = sizes.index(max(sizes))
+        if others := ", ".join(f"number {k + 1} ({size})" for k, size in enumerate(sizes) if k != best):
+            self.notes.append(f"{self.src}: of its {len(sizes)} {what} number {best + 1} is taken, with {sizes[best]} "
+                              f"photographs; not used: {others}")  # fmt: skip
+        return best
+
     def mask_at(self, path: str, what: str) -> Path:
         """The mask at a path that the file says. Raises InputError, which begins with `what`, if there is none."""
         if is_file(file := self.beside / path):

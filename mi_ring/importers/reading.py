@@ -142,6 +142,13 @@ def load_json(path: Path) -> Any:
     return read_as(path, "JSON", lambda file: json.loads(file.read_bytes()))
 
 
+def require_object(value: Any, what: str) -> dict:
+    """Return the value. Raises InputError, which begins with `what`, if it is no JSON object."""
+    if not isinstance(value, dict):
+        raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
+    return value
+
+
 def load_xml(path: Path) -> ElementTree.Element:
     """Read the root of an XML file."""
     return read_as(path, "XML", lambda file: ElementTree.fromstring(file.read_bytes()))

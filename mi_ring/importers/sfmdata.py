@@ -11,12 +11,25 @@ from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import load_json, matrix
+from mi_ring.importers.reading import load_json, matrix, require_object
 
 #: Number of coefficients of each distortion model, by both programs' names. Of five, the last two are tangential.
 MODELS = {
     "pinhole": 0, "none": 0, "radial1": 1, "radialk1": 1, "radial3": 3, "radialk3": 3, "brown": 5, "fisheye4": 4,
     "fisheye": 4, "pinhole_radial_k1": 1, "pinhole_radial_k3": 3, "pinhole_brown_t2": 5,
+}  # fmt: skip
+#: Fields of AliceVision that are used.
+USED = {
+    "path", "poseId", "viewId", "intrinsicId", "isPoseIndependant", "pose", "transform", "rotationOnly", "width",
+    "height", "type", "pxFocalLength", "focalLength", "sensorWidth", "pixelRatio", "principalPoint", "distortionType",
+    "distortionParams", "undistortionType",
+}  # fmt: skip
+#: Fields of AliceVision that change nothing: names, what the program began with and held fixed, earlier photographs.
+HARMLESS = {
+    "rigId", "subPoseId", "frameId", "resectionId", "metadata", "ancestors", "ancestorImages", "locked", "removable",
+    "sensorHeight", "serialNumber", "initializationMode", "initialFocalLength", "pxInitialFocalLength",
+    "pixelRatioLocked", "offsetLocked", "scaleLocked", "distortionLocked", "distortionInitializationMode",
+    "undistortionOffset", "undistortionParams",
 }  # fmt: skip
 COEFFICIENTS = ("disto_k1", "disto_k3", "disto_t2", "fisheye")  #: OpenMVG's fields of the coefficients
 
@@ -39,6 +52,7 @@ class SfmData(Photogrammetry):
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
         poses = self.by_key(top, "poses", "poseId")
+        unknown: list[str] = []
         for k, view in enumerate(top["views"]):
             what = f"{self.src}: views[{k}]"
             file = file_name(require_object(view, what), "path", what)
@@ -48,8 +62,11 @@ class SfmData(Photogrammetry):
                 continue
             if str(view.get("isPoseIndependant", True)).lower() == "false":
                 raise InputError(f"{what}: isPoseIndependant: is false; photographs of rigs are not supported")
-            transform = require_object(own.get("pose"), f"{what}: pose").get("transform")
-            transform = require_object(transform, f"{what}: pose.transform")
+            place = require_object(own.get("pose"), f"{what}: pose")
+            if str(place.get("rotationOnly")).lower() in ("true", "1"):
+                self.without_pose.add(PureWindowsPath(file).name)
+                continue
+            transform = require_object(place.get("transform"), f"{what}: pose.transform")
             pose = np.eye(4)
             # The file has the world-to-camera rotation by columns. Read by rows, it is the camera-to-world rotation.
             pose[:3, :3] = matrix(transform.get("rotation"), (9,), f"{what}: pose.rotation").reshape(3, 3)
@@ -57,7 +74,10 @@ class SfmData(Photogrammetry):
             key = str(view.get("intrinsicId"))
             intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
             lens = alicevision_lens(intrinsic, version, f"{self.src}: intrinsic {key!r}")
+            unknown += [name for fields in (view, own, place, intrinsic) for name in fields
+                        if name not in USED | HARMLESS]  # fmt: skip
             yield from self.frame(file, lens, pose, what)
+        self.note_unknown(self.src, unknown)
 
     def openmvg(self, top: dict) -> Iterator[Frame]:
         """The photographs of a scene of OpenMVG. Its library cereal names a polymorphic type only at its first use."""
@@ -96,13 +116,6 @@ class SfmData(Photogrammetry):
         """The frame of a photograph, which may have been moved; nothing if there is no such photograph."""
         if own := self.photograph(file, what, relative=True):
             yield Frame(own, lens, pose, said=file)
-
-
-def require_object(value: Any, what: str) -> dict:
-    """Return the value. Raises InputError, which begins with `what`, if it is no JSON object."""
-    if not isinstance(value, dict):
-        raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
-    return value
 
 
 def file_name(view: dict, field: str, what: str) -> str:

@@ -78,8 +78,7 @@ class Transforms(NamedPhotographs):
             if (position := own.get("pl_pos")) is not None:
                 frame.light = Light("point", matrix(position, (3,), f"{path}: {where}.pl_pos"), intensity)
             yield frame
-        if unknown:
-            self.notes.append(f"{path}: not used, because unknown: {', '.join(dict.fromkeys(unknown))}")
+        self.note_unknown(path, unknown)
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:

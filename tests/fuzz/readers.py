@@ -15,7 +15,7 @@ import mi_ring  # noqa: F401  (chooses LLVM before Mitsuba is imported)
 import mitsuba as mi
 import torch
 import trimesh
-from helpers import foreign_captures, merl_tables, photogrammetry_files
+from helpers import foreign_captures, merl_tables, photogrammetry_files, structure_files
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import fitted_scene_xml
@@ -181,6 +181,60 @@ def colmap_of(folder: Path, model: str, suffix: str) -> Reader:
     return Reader(
         sorted((folder / model).glob(f"*{suffix}")), imported(colmap.Colmap, images=folder / "images")(folder / model)
     )
+
+
+def colmap_rig(folder: Path) -> Reader:
+    model = structure_files.colmap_rig(folder)
+    return Reader(sorted(model.glob("*.txt")), imported(colmap.Colmap)(folder))
+
+
+def metashape_rig(folder: Path) -> Reader:
+    path = structure_files.metashape_rig(folder, 2.5)
+    return Reader([path], imported(Metashape)(path))
+
+
+def bundler(folder: Path) -> Reader:
+    path = structure_files.bundler(folder)
+    return Reader([path, folder / "list.txt"], imported(formats.FORMATS["bundler"])(path))
+
+
+def structure(name: str) -> Callable[[Path], Reader]:
+    """A reader of a format that is one file of `structure_files`."""
+
+    def of(folder: Path) -> Reader:
+        path = getattr(structure_files, name)(folder)
+        return Reader([path], imported(formats.FORMATS[name])(path))
+
+    return of
+
+
+def glb(folder: Path) -> Reader:
+    path = structure_files.gltf(folder, ".glb")
+    return Reader([path], imported(formats.FORMATS["gltf"])(path))
+
+
+def polycam(folder: Path) -> Reader:
+    structure_files.polycam(folder)
+    return Reader(sorted(folder.rglob("*.json")), imported(formats.FORMATS["polycam"])(folder))
+
+
+def record3d(folder: Path) -> Reader:
+    structure_files.record3d(folder)
+    return Reader([folder / "metadata.json"], imported(formats.FORMATS["record3d"])(folder))
+
+
+def guessed(folder: Path) -> Reader:
+    """All that `convert` looks for without a format."""
+    structure_files.polycam(folder)
+    structure_files.record3d(folder)
+    files = [
+        structure_files.bundler(folder),
+        structure_files.visualsfm(folder),
+        structure_files.opensfm(folder),
+        structure_files.gltf(folder),
+        folder / "metadata.json",
+    ]
+    return Reader(files, lambda: documented(lambda: formats.guess(folder)))
 
 
 def detected(folder: Path) -> Reader:
@@ -389,7 +443,10 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "metashape": metashape, "realitycapture-xmp": sidecars, "realitycapture-csv": table, "llff": llff,
     "middlebury": middlebury, "sfmdata-alicevision": alicevision, "sfmdata-openmvg": openmvg, "transforms": transforms,
     "neus": neus, "wildlight": wildlight, "iron": iron, "diligent-mv": diligent, "colmap-text": colmap_text,
-    "colmap-binary": colmap_binary, "detect": detected, "scene": scene, "ring.pt": ring, "checkpoint.pt": checkpoint,
+    "colmap-binary": colmap_binary, "colmap-rig": colmap_rig, "metashape-rig": metashape_rig, "bundler": bundler,
+    "visualsfm": structure("visualsfm"), "opensfm": structure("opensfm"), "gltf-cameras": structure("gltf"),
+    "glb-cameras": glb, "polycam": polycam, "record3d": record3d, "guess": guessed, "detect": detected,
+    "scene": scene, "ring.pt": ring, "checkpoint.pt": checkpoint,
     "results": results, "config.json": settings, "merl-networks": networks, "synthesize": synthesized,
     "merl-table": merl, "ply": mesh(".ply"), "obj": mesh(".obj"),
     "stl": mesh(".stl"), "glb": mesh(".glb"),

@@ -174,7 +174,8 @@ def alicevision(folder, version="1.2.14", own=None):
     """A scene of Meshroom, whose numbers are strings, as its library of JSON writes them."""
     intrinsic = {
         "intrinsicId": 5, "width": W, "height": H, "sensorWidth": SENSOR_WIDTH, "type": "pinhole", "locked": 0,
-        "principalPoint": [*OFFSET], "distortionParams": "", "undistortionType": "none",
+        "principalPoint": [*OFFSET], "distortionParams": "", "undistortionType": "none", "sensorHeight": 15.6,
+        "serialNumber": "7", "initializationMode": "estimated", "undistortionOffset": [0, 0], "undistortionParams": "",
     }  # fmt: skip
     order = tuple(map(int, version.split(".")))
     if order < (1, 2, 2):
@@ -191,7 +192,8 @@ def alicevision(folder, version="1.2.14", own=None):
                              "width": W, "height": H, "metadata": ""})  # fmt: skip
         columns = np.ravel(R, order="F")  # as Eigen's matrices lie in memory
         transform = {"rotation": columns.tolist(), "center": (-R.T @ t).tolist()}
-        top["poses"].append({"poseId": 20 + k, "pose": {"transform": transform, "locked": 1}})
+        own_pose = {"transform": transform, "locked": 1, "rotationOnly": False, "removable": True}
+        top["poses"].append({"poseId": 20 + k, "pose": own_pose})
     top["views"].append({"viewId": 99, "poseId": 99, "intrinsicId": 5, "path": "/photos/lost.png"})
     photographs(folder / "images")
     (folder / "cameras.sfm").write_text(json.dumps(strings(top)))

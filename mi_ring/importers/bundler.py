@@ -1,0 +1,91 @@
+"""Bundler's cameras, which other programs write too.
+
+Fields:
+
+- used: f, k1, k2 (a camera with f = 0 has no pose); R, t (world to camera, which looks along -z, y up)
+- harmless: points; focal lengths in list.txt, where the program began
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.importers.camera_models import camera_to_world, opencv_lens
+from mi_ring.importers.frames import OPENGL, Frame
+from mi_ring.importers.photogrammetry import Photogrammetry
+from mi_ring.importers.reading import first_file, image_size, load_lines, matrix, read_as
+
+FIRST_LINE = "# Bundle file"
+LISTED = re.compile(r"\s*(.*?)(?:\s+0\s+[-+.\deE]+)?\s*$")  #: a line of list.txt: name, and 0 with a focal length
+MAX_CAMERAS = 10**6
+
+
+@dataclass(frozen=True)
+class Bundler(Photogrammetry):
+    """Bundler: bundle.out with list.txt. The light is beside the camera.
+
+    SRC is the file, or a folder with bundle.out or bundle/bundle.out. The photographs are named in list.txt, or of
+    pot.bundle.out in pot.list.txt, beside SRC or above it. The file gives no sizes: the photographs must have their
+    original size.
+    """
+
+    @property
+    def cameras(self) -> Path:
+        """The file of the cameras."""
+        if not self.src.is_dir():
+            return self.src
+        return first_file([self.src / "bundle.out", self.src / "bundle" / "bundle.out"], "SRC")
+
+    @property
+    def listed(self) -> Path:
+        """The file of the names of the photographs."""
+        path = self.cameras
+        names = [path.with_name(path.name.replace("bundle", "list")).with_suffix(".txt"), path.with_name("list.txt")]
+        return first_file([*dict.fromkeys([*names, path.parent.parent / "list.txt"])], f"{path}: list.txt")
+
+    @property
+    def beside(self) -> Path:
+        return self.listed.parent
+
+    def posed(self) -> Iterator[Frame]:
+        path, listed = self.cameras, self.listed
+        photographs = [LISTED.sub(r"\1", line) for line in load_lines(listed)]
+        rows = read_cameras(path)
+        if len(rows) != len(photographs):
+            raise InputError(f"{listed}: names {len(photographs)} photographs, but {path.name} has {len(rows)} "
+                             "cameras; give the list of this reconstruction")  # fmt: skip
+        for name, ((f, k1, k2), *R, t) in zip(photographs, rows):
+            if not f:
+                self.without_pose.add(name)
+            elif image := self.photograph(name, str(listed), relative=True):
+                size = image_size(image)
+                lens = opencv_lens(size, (f, f, size[0] / 2, size[1] / 2), (k1, k2, 0.0), (0.0, 0.0))
+                yield Frame(image, lens, camera_to_world(matrix(R, (3, 3), name), t) @ OPENGL, said=name)
+
+
+def read_cameras(path: Path) -> np.ndarray:
+    """The cameras (N, 5, 3) of a bundle file: f, k1, k2; three rows of R; t."""
+
+    def read(file: Path) -> tuple[list[str], list[str]]:
+        with file.open(encoding="utf-8") as text:
+            head = list(islice(text, 2))
+            return head, list(islice(text, 5 * count_in(head, path)))
+
+    head, lines = read_as(path, "text", read)
+    count = count_in(head, path)
+    return matrix(" ".join(lines).split(), (15 * count,), f"{path}: its {count} cameras").reshape(-1, 5, 3)
+
+
+def count_in(head: list[str], path: Path) -> int:
+    """The number of cameras by the first two lines of a bundle file."""
+    if not head or not head[0].startswith(FIRST_LINE):
+        raise InputError(f"{path}: SRC: does not begin with {FIRST_LINE!r}; must be a file of Bundler's, bundle.out")
+    word = (head[1].split() or [""])[0] if len(head) > 1 else ""
+    if not word.isdecimal() or not 0 < len(word) < 8 or not 0 < int(word) <= MAX_CAMERAS:
+        raise InputError(f"{path}: line 2: is {word[:40]!r}; must be the number of cameras, 1 to {MAX_CAMERAS}")
+    return int(word)

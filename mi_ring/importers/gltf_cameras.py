@@ -1,0 +1,135 @@
+"""Cameras in glTF files, as Blender exports them.
+
+Fields:
+
+- used: name, camera, children, matrix, translation, rotation and scale of nodes; name, yfov and aspectRatio of cameras
+- refused: orthographic cameras
+- noted: extensions of lights; the light is where the options say
+- harmless: znear and zfar of cameras; meshes, materials, textures, animations
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+from scipy.spatial.transform import Rotation
+
+from mi_ring.errors import InputError
+from mi_ring.importers.camera_models import Lens
+from mi_ring.importers.frames import OPENGL, Frame
+from mi_ring.importers.photogrammetry import Photogrammetry
+from mi_ring.importers.reading import image_size, matrix, read_as
+
+SUFFIXES = (".gltf", ".glb")
+#: Older versions of Blender give each camera a child node, which turns it.
+CHILD = "_Orientation"
+
+
+@dataclass(frozen=True)
+class GltfCameras(Photogrammetry):
+    """Blender's cameras: File > Export > glTF 2.0 with cameras. The light is beside the camera.
+
+    SRC is the .gltf or .glb. A photograph has the name of its camera's object, or of its camera. glTF has neither lens
+    distortion nor a shift of the lens: the principal point is in the middle.
+    """
+
+    def posed(self) -> Iterator[Frame]:
+        gltf = read_gltf(self.src)
+        placed = dict(placed_nodes(gltf, self.src))
+        found = [k for k in sorted(placed) if gltf.nodes[k].camera is not None]
+        if not found:
+            raise InputError(f"{self.src}: SRC: has no node with a camera; export with Include > Cameras")
+        for k in found:
+            node = gltf.nodes[k]
+            camera = entry(gltf.cameras, node.camera, f"{self.src}: nodes[{k}].camera")
+            names = dict.fromkeys(
+                str(own) for own in (node.name, str(node.name).removesuffix(CHILD), camera.name) if own
+            )
+            what = f"{self.src}: camera {next(iter(names), '')!r}"
+            if not names:
+                raise InputError(f"{what}: nodes[{k}].name: is missing; must be the name of a photograph")
+            name = next((own for own in names if self.photograph_files.find(own)[0]), next(iter(names)))
+            if (image := self.photograph(name, what)) is None:
+                continue
+            if camera.perspective is None:
+                raise InputError(f"{what}: type: is {str(camera.type)!r}; must be perspective")
+            yield Frame(image, lens_of(camera.perspective, image, what), rigid(placed[k], what) @ OPENGL, said=name)
+        self.note_unknown(self.src, (str(name) for name in gltf.extensionsUsed or () if "lights" in str(name)))
+
+
+def read_gltf(path: Path) -> pygltflib.GLTF2:
+    """A glTF file without its buffers."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: SRC: must end in {' or '.join(SUFFIXES)}")
+    return read_as(path, "glTF", lambda file: pygltflib.GLTF2().load(str(file)))
+
+
+def has_cameras(path: Path) -> bool:
+    """Are there several cameras in a glTF file? One may be that of a viewer."""
+    return sum(node.camera is not None for node in read_gltf(path).nodes) > 1
+
+
+def entry(things: list, index: object, what: str) -> pygltflib.Property:
+    """The entry of a list by its index in the file. Raises InputError, which begins with `what`, if there is none."""
+    if not isinstance(index, int) or not 0 <= index < len(things):
+        raise InputError(f"{what}: is {str(index)[:40]}; there is none of this number")
+    return things[index]
+
+
+def placed_nodes(gltf: pygltflib.GLTF2, path: Path) -> Iterator[tuple[int, np.ndarray]]:
+    """All nodes, by number, with their transforms to the world (4, 4). Raises InputError if the tree has a loop."""
+    inner = {child for node in gltf.nodes for child in node.children or ()}
+    waiting = [(k, np.eye(4)) for k in range(len(gltf.nodes)) if k not in inner]
+    for _ in gltf.nodes:
+        if not waiting:
+            return
+        k, above = waiting.pop()
+        what = f"{path}: nodes[{k}]"
+        place = above @ transform_of(entry(gltf.nodes, k, what), what)
+        yield k, place
+        waiting += [(child, place) for child in gltf.nodes[k].children or ()]
+    if waiting:
+        raise InputError(f"{path}: nodes: some are children of several nodes, or of themselves")
+
+
+def transform_of(node: pygltflib.Node, what: str) -> np.ndarray:
+    """The transform (4, 4) of a node to its parent: its matrix, which is by columns, or its three parts."""
+    if node.matrix is not None:
+        return matrix(node.matrix, (16,), f"{what}.matrix").reshape(4, 4).T
+    place = np.eye(4)
+    quaternion = matrix(node.rotation or [0, 0, 0, 1], (4,), f"{what}.rotation")
+    if abs(np.linalg.norm(quaternion) - 1) > 1e-2:
+        raise InputError(f"{what}.rotation: is of length {np.linalg.norm(quaternion):.3g}; must be 1")
+    scale = matrix(node.scale or [1, 1, 1], (3,), f"{what}.scale")
+    place[:3, :3] = Rotation.from_quat(quaternion).as_matrix() * scale
+    place[:3, 3] = matrix(node.translation or [0, 0, 0], (3,), f"{what}.translation")
+    return place
+
+
+def rigid(place: np.ndarray, what: str) -> np.ndarray:
+    """A transform without its scale, which changes no picture. Raises InputError if it shears or is a mirror."""
+    scale = np.cbrt(np.linalg.det(place[:3, :3]))
+    if not scale > 0 or not np.allclose(place[:3, :3].T @ place[:3, :3], scale**2 * np.eye(3), atol=1e-4 * scale**2):
+        raise InputError(f"{what}: scale: it and its parents scale axes differently, or mirror; apply the scales in "
+                         "Blender")  # fmt: skip
+    pose = place.copy()
+    pose[:3, :3] /= scale
+    return pose
+
+
+def lens_of(perspective: pygltflib.Perspective, image: Path, what: str) -> Lens:
+    """The lens of a photograph by the vertical field of view [rad] and the aspect ratio of its camera."""
+    yfov = float(matrix(perspective.yfov, (), f"{what}: yfov"))
+    if not 0 < yfov < math.pi:
+        raise InputError(f"{what}: yfov: is {yfov:g}; must be between 0 and pi")
+    width, height = size = image_size(image)
+    ratio = perspective.aspectRatio
+    ratio = width / height if ratio is None else float(matrix(ratio, (), f"{what}: aspectRatio"))
+    if abs(ratio * height - width) > 1:
+        raise InputError(f"{what}: aspectRatio: is {ratio:.5g}, but {image.name} has {width} x {height} pixels; set "
+                         "the resolution of the photographs in Blender, and export again")  # fmt: skip
+    fy = height / 2 / math.tan(yfov / 2)
+    return Lens("PINHOLE", size, (fy * width / (ratio * height), fy, width / 2, height / 2))

@@ -1,0 +1,63 @@
+"""Polycam's raw data."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_ring.errors import InputError
+from mi_ring.importers.camera_models import Lens
+from mi_ring.importers.frames import OPENGL, Frame
+from mi_ring.importers.photogrammetry import Photogrammetry
+from mi_ring.importers.reading import load_json, matrix, require_object
+
+#: Fields that are used: entries of the camera-to-world matrix by row and column, and the lens [px].
+USED = [*(f"t_{row}{column}" for row in range(3) for column in range(4)), "fx", "fy", "cx", "cy", "width", "height"]
+#: Fields that change nothing: how good a picture is, and what is near it.
+HARMLESS = {"timestamp", "blur_score", "neighbors", "manual_keyframe", "center_depth", "angular_velocity"}
+
+
+@dataclass(frozen=True)
+class Polycam(Photogrammetry):
+    """Polycam: raw data, exported in developer mode. The light is beside the camera.
+
+    SRC is the folder of the export, or its folder keyframes. The corrected cameras and images are taken, if there are
+    any. The camera looks along -z, y is up; y of the world is up.
+    """
+
+    @property
+    def corrected(self) -> str:
+        """What the names of the folders begin with: `corrected_`, or nothing."""
+        return "corrected_" if (self.keyframes / "corrected_cameras").is_dir() else ""
+
+    @property
+    def keyframes(self) -> Path:
+        """The folder of the cameras and images."""
+        return inner if (inner := self.src / "keyframes").is_dir() else self.src
+
+    @property
+    def folder(self) -> Path:
+        return self.images or self.keyframes / f"{self.corrected}images"
+
+    def posed(self) -> Iterator[Frame]:
+        folder = self.keyframes / f"{self.corrected}cameras"
+        files = sorted(folder.glob("[!.]*.json"))
+        if not files:
+            raise InputError(f"{folder}: SRC: found no *.json; must be raw data of Polycam, with a folder keyframes")
+        if not self.corrected:
+            self.notes.append(f"{folder}: Polycam has not corrected these cameras; they are those of the phone, which "
+                              "are less exact")  # fmt: skip
+        unknown: list[str] = []
+        for path in files:
+            given = require_object(load_json(path), str(path))
+            if (image := self.photograph(f"{path.stem}.jpg", str(path))) is None:
+                continue
+            numbers = [float(matrix(given.get(name), (), f"{path}: {name}")) for name in USED]
+            pose = np.vstack([np.reshape(numbers[:12], (3, 4)), [0, 0, 0, 1]])
+            size: Any = numbers[16:]
+            unknown += [name for name in given if name not in HARMLESS.union(USED)]
+            lens = Lens("PINHOLE", size, tuple(numbers[12:16]))  # Lens truncates
+            yield Frame(image, lens, pose @ OPENGL, said=f"{path.stem}.jpg")
+        self.note_unknown(folder, unknown)

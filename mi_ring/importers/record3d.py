@@ -1,0 +1,59 @@
+"""Record3D's exports."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mi_ring.errors import InputError
+from mi_ring.importers.camera_models import Lens
+from mi_ring.importers.frames import OPENGL, Frame
+from mi_ring.importers.photogrammetry import Photogrammetry
+from mi_ring.importers.reading import list_images, load_json, matrix, require_object
+
+#: Fields that are used, and those that change nothing: depth maps, times, and the pose to which none is relative.
+KNOWN = {"K", "perFrameIntrinsicCoeffs", "w", "h", "poses"} | {
+    "dw", "dh", "fps", "initPose", "frameTimestamps", "cameraType", "depthScale",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Record3D(Photogrammetry):
+    """Record3D: metadata.json beside a folder rgb. The light is beside the camera.
+
+    SRC is the folder. K is by columns. perFrameIntrinsicCoeffs are fx, fy, cx, cy of each photograph, if there are any.
+    poses are quaternions x y z w and positions, camera to world; the camera looks along -z, y is up. The names of the
+    photographs are the numbers of the poses.
+    """
+
+    @property
+    def folder(self) -> Path:
+        return self.images or self.src / "rgb"
+
+    def posed(self) -> Iterator[Frame]:
+        path = self.src / "metadata.json"
+        given = require_object(load_json(path), str(path))
+        poses, size = given.get("poses"), matrix([given.get("w"), given.get("h")], (2,), f"{path}: w, h")
+        if not isinstance(poses, list) or not poses:
+            raise InputError(f"{path}: poses: found none; must be a list of 7 numbers for each photograph")
+        lenses = given.get("perFrameIntrinsicCoeffs") or []
+        if lenses:
+            lenses = matrix(lenses, (len(poses), 4), f"{path}: perFrameIntrinsicCoeffs")
+        else:
+            K = matrix(given.get("K"), (9,), f"{path}: K").reshape(3, 3).T
+            if K[2, :2].any() or K[0, 1] or K[1, 0]:
+                raise InputError(f"{path}: K: is {K.T.ravel()}; must be fx 0 0 0 fy 0 cx cy 1, by columns")
+            lenses = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(poses), 1))
+        names = {int(file.stem): file.name for file in list_images(self.folder) if file.stem.isdecimal()}
+        for k, (own, params) in enumerate(zip(poses, lenses)):
+            what = f"{path}: poses[{k}]"
+            numbers = matrix(own, (7,), what)
+            if abs(np.linalg.norm(numbers[:4]) - 1) > 1e-2:
+                raise InputError(f"{what}: its quaternion is of length {np.linalg.norm(numbers[:4]):.3g}; must be 1")
+            if image := self.photograph(name := names.get(k, f"{k}.jpg"), what):
+                pose = np.eye(4)
+                pose[:3, :3], pose[:3, 3] = Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:]
+                yield Frame(image, Lens("PINHOLE", (size[0], size[1]), tuple(params)), pose @ OPENGL, said=name)
+        self.note_unknown(path, (name for name in given if name not in KNOWN))
