@@ -33,7 +33,7 @@ from mi_ring.photogrammetry.folder import (
     up_directions,
     without_flash,
 )
-from mi_ring.photogrammetry.matching import static_share
+from mi_ring.photogrammetry.matching import BATCH, static_share
 from mi_ring.photogrammetry.object_masks import SegmentedObject
 from mi_ring.photogrammetry.structure_from_motion import SparseModel, structure_from_motion
 from mi_ring.photogrammetry.workflow import imported_cameras, posed_pictures, require_same_photographs
@@ -193,7 +193,7 @@ def test_photographs_from_one_place_are_told_after_the_first_pairs(tmp_path, spe
 
     with pytest.raises(InputError, match=r"100% of the first 60 pairs are from one place; walk around"):
         structure_from_motion(find_pictures(tmp_path), {}, tmp_path / "work", counting)
-    assert batches.count("matching") == 1
+    assert batches.count("matching") == BATCH
     database = tmp_path / "work/database.db"  # where an interrupted one goes on there are more pairs than are asked for
     assert static_share(database, [("01.png", "00.png"), ("02.png", "03.png")]) == 1
     assert static_share(database, [("01.png", "00.png"), ("12.png", "13.png")]) == 0.5

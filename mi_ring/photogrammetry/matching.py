@@ -1,7 +1,7 @@
 """Features of the photographs by COLMAP's library, and matches between them by matrix products."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ DECODED = 2  #: photographs that are decoded at a time
 LENGTH = 512.0  #: of a descriptor
 #: Largest angle between the descriptors of a match [radians], also as a share of the angle to the second nearest one:
 #: RATIO to find the geometry of two photographs, LOOSE for matches that agree with it.
-ANGLE, RATIO, LOOSE = 0.7, 0.8, 1.0
+ANGLE, RATIO, LOOSE = 0.7, 0.8, 0.95
 FAR = 4.0  #: the largest distance of a match that agrees [px]
 BLOCK = 512  #: rows of a matrix of products that is computed at a time, so that it stays in the processor's cache
 ALL_PAIRS = 60  #: all pairs of up to this number of photographs are matched
@@ -224,6 +224,29 @@ def match_pairs(
                 for (a, b), geometry in zip(new, in_parallel(match_pair, *zip(*new))):
                     opened.write_two_view_geometry(a.image, b.image, geometry)
             yield from batch
+
+
+def match_again(files: Collection[str], folder: Path, progress: Progress) -> bool:
+    """Match these files again where pairs match: by guided matching, which finds more matches, and more wrong ones.
+
+    Guided matching searches for matches along the epipolar lines alone. Returns whether there was such a pair.
+    """
+    database, listed = folder / "database.db", folder / "pairs.txt"
+    pairs = [(a.name, b.name) for a, b, first, _ in read_matches(database)
+             if len(first) and (a.name in files or b.name in files)]  # fmt: skip
+    options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0  # otherwise it depends on the thread
+    for batch in progress(list(batches(pairs, BATCH)), "matching again"):
+        with pycolmap.Database.open(database) as opened:
+            ids = {image.name: image.image_id for image in opened.read_all_images()}
+            for a, b in batch:
+                opened.delete_matches(ids[a], ids[b])
+                opened.delete_two_view_geometry(ids[a], ids[b])
+        listed.write_text("".join(f"{a} {b}\n" for a, b in batch), "utf-8")
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+        interruptible(pycolmap.match_image_pairs, database, options, pairing, verification)
+    return bool(pairs)
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:

@@ -18,7 +18,14 @@ from mi_ring.importers.camera_models import Lens
 from mi_ring.photogrammetry.bundle_adjustment import adjust, model_cameras, registered
 from mi_ring.photogrammetry.folder import Picture
 from mi_ring.photogrammetry.marker_sheet import Detections
-from mi_ring.photogrammetry.matching import MIN_MATCHES, find_features, grey_file, match_features, read_matches
+from mi_ring.photogrammetry.matching import (
+    MIN_MATCHES,
+    find_features,
+    grey_file,
+    match_again,
+    match_features,
+    read_matches,
+)  # fmt: skip
 from mi_ring.system.machine import interruptible
 from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
@@ -72,7 +79,11 @@ def structure_from_motion(
     find_features(pictures, folder, progress)
     match_features(pictures, folder, progress)
     model = reconstruct(folder, len(pictures), progress)
-    placed = {model.images[k].name for k in model.reg_image_ids()} if model else set()
+    placed = placed_files(model)
+    if (missing := {grey_file(picture) for picture in pictures} - placed) and match_again(missing, folder, progress):
+        other = reconstruct(folder, len(pictures), progress)
+        if len(placed_files(other)) > len(placed):
+            model, placed = other, placed_files(other)
     count = len(placed)
     if count < max(3, len(pictures) / 2):
         names = [picture.name for picture in pictures if grey_file(picture) in placed]
@@ -85,6 +96,11 @@ def structure_from_motion(
     model.write(partial)
     partial.rename(sparse)
     return to_sparse_model(model, pictures, folder)
+
+
+def placed_files(model: Any) -> set[str]:
+    """The files that have a pose in a model; none if there is no model."""
+    return {model.images[k].name for k in model.reg_image_ids()} if model else set()
 
 
 def reconstruct(folder: Path, count: int, progress: Progress) -> Any:

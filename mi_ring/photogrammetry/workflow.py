@@ -132,6 +132,9 @@ def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
                 source.src, *frames[p.name].lens.size, p.path.name, *p.size))  # fmt: skip
     cameras = {p.name: (frames[p.name].lens, frames[p.name].pose) for p in pictures if p.name in frames}
     failed = {p.name: f"{source.src} has no camera for it" for p in pictures if p.name not in frames}
+    if not cameras and source.scene.absolute().parent != pictures[0].path.absolute().parent:
+        print(f"{source.src}: has cameras of other photographs alone; left out")
+        return None
     if len(cameras) < len(failed):
         raise InputError(f"{source.src}: has cameras for {len(cameras)} of {len(pictures)} photographs; move it away "
                          "to have cameras found in the photographs")  # fmt: skip
