@@ -23,8 +23,13 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import find_pending_xref_condition, make_refnode
 
 import mi_ring
+from mi_ring import image_fields
 from mi_ring.__main__ import COMMANDS, summary
+from mi_ring.importers import reading
 from mi_ring.importers.formats import FORMATS
+from mi_ring.importers.photogrammetry import Photogrammetry
+from mi_ring.importers.transforms import Transforms
+from mi_ring.photogrammetry import folder
 
 project, author = "mi_ring", "the authors of mi_ring"
 extensions = ["sphinx.ext.autodoc", "myst_parser", "sphinx_design"]
@@ -96,6 +101,43 @@ class Commands(SphinxDirective):
         return self.parse_text_to_nodes(text, allow_section_headings=True)
 
 
+class Formats(SphinxDirective):
+    """`.. formats::`: which commands read which image files, and the cameras of which tools."""
+
+    def run(self) -> list[nodes.Node]:
+        self.env.note_dependency(inspect.getsourcefile(image_fields))
+        readers = {
+            "photos": folder.SUFFIXES, "convert": reading.image_headers.SUFFIXES, "check, fit, render, evaluate":
+            reading.image_headers.SUFFIXES, "masks": reading.image_headers.SUFFIXES,
+        }  # fmt: skip
+        rows = [["image files", "suffixes", *readers]]
+        for kind, suffixes in image_fields.KINDS.items():
+            marks = ["yes" if {*suffixes} <= {*own} else "no" for own in readers.values()]
+            rows.append([kind, names(suffixes), *marks])
+        options = {"``--images``": "images", "``--masks``": "masks", "``--flash-offset``": "flash_offset"}
+        cameras = [["cameras", "``convert``", "``photos`` finds them beside photographs", *options]]
+        for name, source in FORMATS.items():
+            known = {field.name for field in dataclasses.fields(source)}
+            found = issubclass(source, (Photogrammetry, Transforms))
+            marks = ["yes" if own else "no" for own in (True, found, *(field in known for field in options.values()))]
+            cameras.append([f"``{name}``", *marks])
+        return self.parse_text_to_nodes(table(rows) + table(cameras))
+
+
+class Fields(SphinxDirective):
+    """`.. fields::`: the fields of all formats, and what is done with them."""
+
+    def run(self) -> list[nodes.Node]:
+        tables = {f"``convert {name}``": source.fields for name, source in FORMATS.items()} | image_fields.FIELDS
+        self.env.note_reread()
+        text = ""
+        for name, fields in tables.items():
+            rows = [["fields", "", "meaning, or why"]]
+            rows += [[names(own.split()), kind, why] for own, kind, why in fields.rows()]
+            text += title(name, "-") + table(rows)
+        return self.parse_text_to_nodes(text, allow_section_headings=True)
+
+
 class Modules(SphinxDirective):
     """`.. modules:: nets.shapenet errors`: what these modules of the package offer, each under a heading."""
 
@@ -134,6 +176,19 @@ def modules_of(package) -> list[str]:
 def title(text: str, line: str) -> str:
     """A heading."""
     return f"{text}\n{line * len(text)}\n\n"
+
+
+def names(words) -> str:
+    """Words as code."""
+    return " ".join(f"``{word}``" for word in words)
+
+
+def table(rows: list[list[str]]) -> str:
+    """A table, whose first row is its head."""
+    lines = [".. list-table::", "   :header-rows: 1", ""]
+    for row in rows:
+        lines += [f"   {'*' if k == 0 else ' '} - {cell}" for k, cell in enumerate(row)]
+    return "\n".join([*lines, "", ""])
 
 
 def literal(text: str) -> str:
@@ -211,6 +266,8 @@ def setup(app):
                 plain(found.__init__)
     app.add_directive("plugin", Plugin)
     app.add_directive("commands", Commands)
+    app.add_directive("formats", Formats)
+    app.add_directive("fields", Fields)
     app.add_directive("modules", Modules)
     app.add_directive("rooms", Rooms)
     app.connect("autodoc-process-signature", signature)

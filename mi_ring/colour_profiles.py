@@ -1,7 +1,7 @@
 """What image files say about their colours: ICC profiles, chunks of PNG, primaries of OpenEXR."""
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import imagecodecs
 import numpy as np
@@ -18,10 +18,39 @@ class Statement(NamedTuple):
     exponent: float | None = None  #: linear = encoded ^ exponent; 2.2 stands for sRGB's curve
 
 
-def primaries_profile(white: tuple, primaries: tuple) -> bytes:
-    """The profile of linear RGB with this white (x, y) and these primaries (x, y of red, green and blue)."""
+def primaries_profile(white: tuple, primaries: tuple, exponent: float = 1.0) -> bytes:
+    """The profile of RGB with this white (x, y) and these primaries (x, y of red, green and blue).
+
+    linear = encoded ^ `exponent`; 2.2 stands for sRGB's curve.
+    """
     places = [value for k in range(3) for value in (*primaries[2 * k : 2 * k + 2], 1.0)]
-    return imagecodecs.cms_profile("rgb", whitepoint=(*white, 1.0), primaries=tuple(places), gamma=1.0)
+    curve: dict[str, Any] = {"gamma": exponent}
+    if exponent == 2.2:
+        x = np.linspace(0, 1, 4096)
+        linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+        curve = {"transferfunction": (linear * 65535 + 0.5).astype(np.uint16)}
+    return imagecodecs.cms_profile("rgb", whitepoint=(*white, 1.0), primaries=tuple(places), **curve)
+
+
+ADOBE_RGB = primaries_profile(WHITE, (0.64, 0.33, 0.21, 0.71, 0.15, 0.06), 563 / 256)
+#: Primaries by the codes of ITU-T H.273; those of BT.709 and unknown ones are sRGB's.
+CODED = {
+    1: PRIMARIES, 2: PRIMARIES, 5: (0.64, 0.33, 0.29, 0.60, 0.15, 0.06), 6: (0.63, 0.34, 0.31, 0.595, 0.155, 0.07),
+    7: (0.63, 0.34, 0.31, 0.595, 0.155, 0.07), 9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046),
+    12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060),
+}  # fmt: skip
+#: Exponents by the codes of transfer curves. Still images with the curve of video, BT.709, are shown as sRGB.
+CURVES = {1: 2.2, 2: 2.2, 4: 2.2, 5: 2.8, 6: 2.2, 8: 1.0, 13: 2.2, 14: 2.2, 15: 2.2}
+
+
+def coded_statement(primaries: int, curve: int) -> Statement:
+    """What the codes of ITU-T H.273 say, in PNG, HEIF and AVIF. Raises ValueError for those of HDR and of others."""
+    if curve not in CURVES or primaries not in CODED:
+        what = {16: "PQ, of HDR", 18: "HLG, of HDR"}.get(curve, f"{primaries}/{curve} by ITU-T H.273")
+        raise ValueError(f"its colours are {what}; save it as sRGB")
+    if CODED[primaries] == PRIMARIES:
+        return Statement(None, CURVES[curve])
+    return Statement(primaries_profile(WHITE, CODED[primaries], CURVES[curve]))
 
 
 @lru_cache(maxsize=8)

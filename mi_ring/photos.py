@@ -16,6 +16,7 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.capture.reduction import WIDTH
 from mi_ring.capture.scenefile import room_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
+from mi_ring.image_headers import encodings
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
@@ -51,12 +52,12 @@ class PhotosConfig:
     """Find cameras and masks of photographs of an object, and write a capture to fit.
 
     The photographs show one object, which does not move, from all around. A flash beside the lens lights it in a dim
-    room. They are JPEG, HEIC, PNG, TIFF or raw files. With a sheet of `mi-ring board` under the object, the capture is
-    in millimetres and upright. After an interruption the same command continues.
+    room. They are JPEG, HEIC, PNG, TIFF, WebP, AVIF, BMP, OpenEXR or raw files. With a sheet of `mi-ring board` under
+    the object, the capture is in millimetres and upright. After an interruption the same command continues.
     """
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
-    """Folder of the photographs: JPEG, HEIC, PNG, TIFF or raw files."""
+    """Folder of the photographs."""
     out: Positional[Annotated[Path, arg(metavar="DIR")]]
     """Folder to write: scene.xml, its files, and work/ with intermediate results.
     If the command is interrupted, it continues from work/."""
@@ -71,7 +72,7 @@ class PhotosConfig:
     """Where the masks of the object come from. Give another source if the masks of auto are wrong.
     auto: found from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
     rembg: the package rembg, which must be installed.
-    A folder: photo.jpg has the mask photo.jpg.png or photo.png."""
+    A folder: photo.jpg has the mask photo.jpg.png, photo.png or photo.jpg."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box around the object in the frame of the sheet [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
     Give it if the masks contain another thing, one that touches the object in the photographs."""
@@ -172,6 +173,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
     elif config.masks == "alpha" and not any(p.path.suffix.lower() in folder.TRANSPARENT for p in pictures):
         require_half(0, pictures, "alpha")
+    print(f"Assumed: {'; '.join(encodings([picture.path for picture in pictures]))}")
     for left in config.out.glob(".scene.*/"):  # left by a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     work = config.out / "work"

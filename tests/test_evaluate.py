@@ -196,6 +196,21 @@ def test_genus_of_all_pieces():
 # Views.
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_a_truth_that_is_inside_out_is_turned_with_a_word(tmp_path, capsys, suffix):
+    """Also an open one, off the origin, with an asymmetric bump."""
+    ball = moved(icosphere(3), 20, CENTER)
+    vertices = np.array(ball.vertices)
+    vertices[vertices[:, 0] > CENTER[0] + 12] *= 1.2
+    for name, faces in (("out", ball.faces), ("in", ball.faces[:, ::-1]), ("open", ball.faces[9:, ::-1])):
+        file = tmp_path / f"{name}{suffix}"
+        trimesh.Trimesh(vertices, faces, process=False).export(file)
+        mesh, _ = surfaces.load_true_mesh(file)
+        assert mesh.volume > 0
+        assert (f"{file}: is inside out, its faces look inwards; they are turned" in capsys.readouterr().err) == (
+            name != "out")  # fmt: skip
+
+
 def test_a_surface_that_is_inside_out_is_flipped(small_capture):
     scene = loading.load_capture(small_capture)
     ball = moved(icosphere(4), 20, CENTER)

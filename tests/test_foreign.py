@@ -14,14 +14,15 @@ import torch
 import trimesh
 from PIL import ExifTags, Image, ImageFile
 
-from mi_ring import foreign, images
+from mi_ring import foreign, image_headers, images
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.checkpoint import FORMAT, read_checkpoint
 from mi_ring.fitting.config import Config
 from mi_ring.foreign import EXPANSION, SMALL, load_npy, load_npz, reading, require_plausible_size, require_readable
 from mi_ring.geometry.meshes import read_mesh
-from mi_ring.images import BoundedFile, write_image
+from mi_ring.image_headers import BoundedFile
+from mi_ring.images import write_image
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import frames_of
 from mi_ring.importers.photogrammetry import exif_values, exposures_of
@@ -98,16 +99,16 @@ def test_pictures_that_declare_to_be_enormous(name, write, tmp_path, monkeypatch
 def test_the_header_of_an_exr_is_what_its_pixels_are(width, height, channels, tmp_path):
     path = tmp_path / "a.exr"
     mi.Bitmap(np.zeros((height, width, channels), np.float32)).write(str(path))
-    assert images.exr_size(path) == (width, height, channels) == (*pixels_of(path).shape[1::-1], channels)
+    assert image_headers.exr_size(path) == (width, height, channels) == (*pixels_of(path).shape[1::-1], channels)
     assert image_size(path) == (width, height)
     bitmap = mi.Bitmap(np.zeros((height, width, channels), np.float32))
     bitmap.metadata()["comments"] = "of what was seen there " * 5000  # by the name's letter before the size
     bitmap.write(str(path))
     assert path.stat().st_size > 2**16
-    assert images.exr_size(path) == (width, height, channels)
+    assert image_headers.exr_size(path) == (width, height, channels)
     path.write_bytes(path.read_bytes()[: 2**16])
     with pytest.raises((ValueError, LookupError)):
-        images.exr_size(path)
+        image_headers.exr_size(path)
 
 
 def test_an_exr_of_one_row_that_is_enormous(tmp_path, monkeypatch):

@@ -12,8 +12,8 @@ import tifffile
 from helpers.foreign_captures import colmap_folder, converted, transforms
 from PIL import Image, ImageCms, PngImagePlugin
 
-from mi_ring import images
-from mi_ring.colour_profiles import primaries_profile
+from mi_ring import image_fields, image_headers, images
+from mi_ring.colour_profiles import Statement, as_stated, primaries_profile
 from mi_ring.errors import InputError
 from mi_ring.importers.photogrammetry import exposures_of
 from mi_ring.importers.reading import has_alpha, pixels_of
@@ -53,6 +53,16 @@ def p3_profile():
                                    transferfunction=(curve * 65535).astype(np.uint16))  # fmt: skip
 
 
+def write_dng(path):
+    mosaic = np.random.default_rng(3).integers(0, 30000, (48, 64), np.uint16)
+    matrix = np.stack([np.diag([10000] * 3).ravel(), np.full(9, 10000)], 1).ravel().tolist()
+    tifffile.imwrite(path, mosaic, photometric=32803, extratags=[
+        (33421, 3, 2, (2, 2), True), (33422, 1, 4, (0, 1, 1, 2), True), (50706, 1, 4, (1, 4, 0, 0), True),
+        (50708, 2, 0, "none", True), (50721, 10, 9, matrix, True), (50728, 5, 3, (1, 1, 1, 1, 1, 1), True),
+        (50717, 3, 1, 65535, True),
+    ])  # fmt: skip
+
+
 def by_pillow(suffix, **options):
     return lambda path, linear: Image.fromarray(eight(linear)).save(path.with_suffix(suffix), **options)
 
@@ -77,6 +87,48 @@ def exr(path, linear, profile=None):
 
 def tiff(pixels, **options):
     return lambda path, linear: tifffile.imwrite(path.with_suffix(".tif"), pixels(linear), **options)
+
+
+def by_tiff(**options):
+    return lambda path, a: tifffile.imwrite(path.with_suffix(".tif"), eight(a), **options)
+
+
+def exr_of(*names):
+    """An OpenEXR file with these channels, of which R, G, B, or the first three, are the stripes; others are 0.3."""
+
+    def write(path, linear):
+        first = [name for name in names if name.rpartition(".")[2] in "RGB"] or names
+        values = {name: linear[..., k] for k, name in enumerate(first[:3])}
+        pixels = np.stack([values.get(name, np.full(linear.shape[:2], 0.3)) for name in names], -1)
+        mi.Bitmap(np.float32(pixels), mi.Bitmap.PixelFormat.MultiChannel, channel_names=[*names]).write(
+            str(path.with_suffix(".exr")))  # fmt: skip
+
+    return write
+
+
+def exr_window(path, linear):
+    """An OpenEXR file that holds a part of its picture."""
+    exr(path, linear)
+    content = path.with_suffix(".exr").read_bytes()
+    place = content.index(b"displayWindow\0box2i\0") + len(b"displayWindow\0box2i\0") + 4
+    path.with_suffix(".exr").write_bytes(content[:place] + struct.pack("<4i", 0, 0, 99, 99) + content[place + 16 :])
+
+
+def coded(suffix, primaries, curve):
+    """A HEIF or AVIF file whose box of colours has these codes of H.273."""
+
+    def write(path, linear):
+        path = path.with_suffix(suffix)
+        picture = Image.fromarray(np.kron(eight(linear), np.ones((4, 4, 1), np.uint8)))
+        if suffix == ".heic":
+            pytest.importorskip("pillow_heif").from_pillow(picture).save(path, quality=-1)
+        else:
+            picture.save(path, quality=100)
+        content = path.read_bytes()
+        place = content.index(b"colrnclx") + 8
+        path.write_bytes(content[:place] + struct.pack(">HH", primaries, curve) + content[place + 4 :])
+
+    return write
 
 
 def srgb16(linear):
@@ -105,7 +157,9 @@ FILES = {
     "tiff float": tiff(lambda a: a.astype(np.float32), photometric="rgb"),
     "tiff half": tiff(lambda a: a.astype(np.float16), photometric="rgb"),
     "tiff planar": tiff(lambda a: eight(a).transpose(2, 0, 1), photometric="rgb", planarconfig="separate"),
-    "exr": exr,
+    "exr": exr, "avif": by_pillow(".avif", quality=100, subsampling="4:4:4"),
+    "heic": lambda path, linear: pytest.importorskip("pillow_heif").from_pillow(Image.fromarray(eight(linear))).save(
+        path.with_suffix(".heic"), quality=-1, chroma=444),
 }  # fmt: skip
 
 
@@ -117,7 +171,7 @@ def written(folder, kind, linear=None):
 @pytest.mark.parametrize("kind", FILES)
 def test_every_kind_of_file_is_read_alike_by_all_commands(tmp_path, kind):
     """By convert and the loader of scenes, undistorted or not, and by photos: the same linear sRGB."""
-    close = 0.02 if "jpeg" in kind else 0.006
+    close = 0.02 if kind in ("jpeg", "jpeg p3", "avif", "heic") else 0.006
     for lens in ({}, {"k1": 1e-9}):
         folder = tmp_path / ("lens" if lens else "plain")
         folder.mkdir()
@@ -127,8 +181,114 @@ def test_every_kind_of_file_is_read_alike_by_all_commands(tmp_path, kind):
         scene = converted("transforms", folder, tmp_path / f"{folder.name}.xml")
         found = scene.observe([0])[0][0].numpy()
         np.testing.assert_allclose(found, stripes(), atol=close)
-    if kind not in ("exr", "tiff float", "tiff half"):  # photos takes no floats
         np.testing.assert_allclose(Picture(file).linear(), stripes(), atol=close)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_every_kind_of_file_is_a_mask_for_all_commands(tmp_path, kind):
+    white = np.zeros((H, W, 3))
+    white[3:17, 5:11] = white[9:12, 20:28] = 1
+    (tmp_path / "masks").mkdir()
+    mask = written(tmp_path / "masks", kind, white)
+    Image.fromarray(eight(stripes())).save(tmp_path / "a.jpg")
+    frames = [{"file_path": "a.jpg", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 70.0, "frames": frames}))
+    for more in ([], ["--masks", tmp_path / "masks"]):
+        scene = converted("transforms", tmp_path, tmp_path / f"s{len(more)}.xml", *more)
+        assert ((scene.masks[0] > 127) == white[..., 0]).all()
+    photograph = Picture(tmp_path / "a.jpg")
+    assert photograph.mask_file(tmp_path / "masks") == mask
+    assert ((photograph.mask(tmp_path / "masks") > 127) == white[..., 0]).all()
+
+
+def test_raw_files_are_read_alike_by_all_commands(tmp_path):
+    pytest.importorskip("rawpy")
+    write_dng(tmp_path / "a.dng")
+    frames = [{"file_path": "a.dng", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 70.0, "frames": frames}))
+    scene = converted("transforms", tmp_path, tmp_path / "s.xml")
+    picture = Picture(tmp_path / "a.dng", upright=False)
+    np.testing.assert_allclose(scene.observe([0])[0][0], picture.linear(), atol=1e-6)
+
+
+def test_floats_are_linear_photographs_for_photos(tmp_path):
+    bright = stripes(np.array([[3.0, 0.5, 0.25], [-0.1, 0, 0], [0.2, 0.3, 0.4], [1, 1, 1]]))
+    file = written(tmp_path, "tiff float", bright)
+    np.testing.assert_allclose(Picture(file).linear(), bright.clip(0, 1), atol=1e-5)
+    tifffile.imwrite(file, np.full((H, W, 3), np.nan, np.float32), photometric="rgb")
+    with pytest.raises(InputError, match="contains pixels that are NaN or infinite"):
+        _ = Picture(file).pixels
+
+
+def test_encodings_that_are_assumed(tmp_path):
+    kinds = ("jpeg", "png p3", "png16 linear", "png16 srgb", "tiff half")
+    for kind in kinds:
+        (tmp_path / kind).mkdir()
+    assert image_headers.encodings([written(tmp_path / kind, kind) for kind in kinds]) == [
+        "2 files of 8 bits are sRGB", "2 files of 16 bits are linear", "1 files of floats are linear",
+        "except as 2 of the files say themselves",
+    ]  # fmt: skip
+
+
+# Fields of image files
+
+#: What the specifications name, and what programs add.
+SAMPLES = {
+    "PNG": """IHDR PLTE IDAT IEND tRNS cHRM gAMA iCCP sBIT sRGB cICP mDCV cLLI tEXt zTXt iTXt bKGD hIST pHYs sPLT eXIf
+     tIME acTL fcTL fdAT oFFs pCAL sCAL sTER gIFg gIFx iDOT
+     CgBI caNv orNT vpAg""",
+    "JPEG": "APP0:JFIF APP0:JFXX APP1:Exif APP1:http://ns.adobe.com/xap/1.0/ APP2:ICC_PROFILE APP2:MPF APP13:Photoshop "
+            "APP14:Adobe COM:text APP11:JP APP2:urn:iso:std:iso:ts:21496:-1 APP15:Q",
+    "TIFF": """NewSubfileType ImageWidth ImageLength BitsPerSample Compression PhotometricInterpretation FillOrder
+     DocumentName ImageDescription Make Model StripOffsets Orientation SamplesPerPixel RowsPerStrip StripByteCounts
+     MinSampleValue MaxSampleValue XResolution YResolution PlanarConfiguration PageName XPosition YPosition
+     GrayResponseUnit T4Options T6Options ResolutionUnit PageNumber TransferFunction Software DateTime Artist
+     HostComputer Predictor WhitePoint PrimaryChromaticities ColorMap HalftoneHints TileWidth TileLength TileOffsets
+     TileByteCounts SubIFDs ExtraSamples SampleFormat SMinSampleValue SMaxSampleValue JPEGTables YCbCrCoefficients
+     YCbCrSubSampling YCbCrPositioning ReferenceBlackWhite XMP Copyright IPTCNAA ImageResources ExifTag
+     InterColorProfile GPSTag ImageSourceData Rating XPTitle GDAL_METADATA ModelPixelScaleTag GeoKeyDirectoryTag
+     IJMetadata""",
+    "OpenEXR": """channels channel:R channel:G channel:B channel:A channel:Y channel:depth.Z compression dataWindow
+     displayWindow lineOrder pixelAspectRatio screenWindowCenter screenWindowWidth tiles type version chunkCount
+     chromaticities whiteLuminance adoptedNeutral renderingTransform lookModTransform xDensity owner comments capDate
+     utcOffset longitude latitude altitude focus expTime aperture isoSpeed envmap keyCode timeCode wrapmodes
+     framesPerSecond multiView worldToCamera worldToNDC preview view BlenderMultiChannel oiio:ColorSpace
+     colorInteropID acesImageContainerFlag""",
+    "WebP, AVIF, HEIF, BMP": "icc_profile exif xmp loop background timestamp duration dpi compression primary "
+                             "bit_depth chroma metadata thumbnails depth_images aux nclx_profile original_orientation",
+    "raw": "mosaic black_level Exif",
+    "EXIF": "Orientation ColorSpace InteropIndex ExposureTime FNumber ISOSpeedRatings WhiteBalance Gamma MakerNote",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", image_fields.FIELDS)
+def test_every_field_of_image_files_is_declared(kind):
+    fields = image_fields.FIELDS[kind]
+    assert not [name for name in SAMPLES[kind].split() if fields.kind_of(name)[0] == "unknown"]
+    assert len(names := fields.names()) == len({*names})
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_nothing_is_told_of_ordinary_files(tmp_path, kind):
+    file = written(tmp_path, kind)
+    assert image_fields.field_names(file)[0] in image_fields.FIELDS and not image_fields.unused_fields(file)
+
+
+@pytest.mark.parametrize(("write", "told"), [
+    (by_pillow(".png", save_all=True, append_images=[Image.new("RGB", SIZE)]),
+     "acTL (further pictures; the first is read)"),
+    (png16((b"hdRI", bytes(4))), "hdRI (unknown)"), (exr_of("R", "G", "B", "N.X"), "channel:N.X (other channels)"),
+    (exr_of("c.R", "c.G", "c.B", "Z"), "channel:Z (other channels)"),
+    (by_tiff(photometric="rgb", extratags=[(318, 5, 2, (3127, 10000, 3290, 10000), True)]),
+     "WhitePoint (colours are read by the profile alone)"),
+])  # fmt: skip
+def test_what_image_files_say_that_is_not_used_is_told(tmp_path, capsys, write, told):
+    write(tmp_path / "a", stripes())
+    file = next(tmp_path.iterdir()).name
+    frames = [{"file_path": file, "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 70.0, "frames": frames}))
+    converted("transforms", tmp_path, tmp_path / "s.xml")
+    assert f"Not used in 1 photographs: {told}\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["png p3", "tiff16 p3", "png16 srgb"])
@@ -147,13 +307,88 @@ def test_an_encoding_that_the_user_says_counts_more_than_the_file(tmp_path):
 
 
 def test_primaries_of_openexr(tmp_path):
-    assert images.statement_of(written(tmp_path, "exr")) == images.Statement()
-    wide = images.as_stated((stripes() @ TO_P3.T).astype(np.float32),
-                            images.Statement(primaries_profile((0.3127, 0.3290), P3)))  # fmt: skip
+    assert image_headers.statement_of(written(tmp_path, "exr")) == Statement()
+    wide = as_stated((stripes() @ TO_P3.T).astype(np.float32),
+                            Statement(primaries_profile((0.3127, 0.3290), P3)))  # fmt: skip
     np.testing.assert_allclose(wide, stripes(), atol=1e-3)
 
 
+@pytest.mark.parametrize(("write", "close"), [
+    (png16((b"cICP", bytes([12, 13, 0, 1]))), 0), (png16((b"cICP", bytes([12, 8, 0, 1]))), 0),
+    (by_pillow(".jpg", quality=100, subsampling=0), 0.02), (coded(".avif", 12, 13), 0.02),
+    (coded(".heic", 12, 13), 0.02),
+])  # fmt: skip
+def test_colours_that_are_said_without_a_profile(tmp_path, write, close):
+    """Display P3 by the codes of H.273, and Adobe RGB by EXIF, are converted by numpy here."""
+    primaries, curve = P3, images.srgb_to_linear
+    encoded = images.linear_to_srgb(stripes())
+    write(tmp_path / "a", stripes())
+    file = next(tmp_path.iterdir())
+    if file.suffix == ".jpg":
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA001] = 65535
+        exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+        Image.open(file).save(file, quality=100, subsampling=0, exif=exif)
+        primaries, curve = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06), lambda v: v ** (563 / 256)
+    elif file.suffix == ".png" and b"cICP\x0c\x08" in file.read_bytes():
+        curve = np.array
+    expected = (curve(encoded) @ (np.linalg.inv(to_xyz(SRGB)) @ to_xyz(primaries)).T).clip(0, 1)
+    found = pixels_of(file, heed=True)
+    scale = 4 if file.suffix in (".avif", ".heic") else 1
+    inside = [3, 12, 20, 27]  # away from the edges of the stripes, where colours of some formats mix
+    np.testing.assert_allclose(
+        found[2::scale, 2::scale][:, inside] / 65535,
+        expected[:1, inside].repeat(len(found[2::scale]), 0),
+        atol=close or 1e-3,
+    )
+
+
+def test_primaries_of_png_chunks(tmp_path):
+    places = struct.pack(">8I", *(round(1e5 * value) for value in (0.3127, 0.3290, *P3)))
+    for k, (chunks, curve) in enumerate((
+        ([(b"cHRM", places)], np.array), ([(b"cHRM", places), (b"gAMA", struct.pack(">I", 50000))], np.square),
+    )):  # fmt: skip
+        png16(*chunks)(tmp_path / str(k), stripes())
+        said = [kind for kind, _ in chunks]
+        encoded = images.linear_to_srgb(stripes()) if b"gAMA" in said or b"cHRM" in said else stripes()
+        expected = (curve(encoded) @ (np.linalg.inv(to_xyz(SRGB)) @ to_xyz(P3)).T).clip(0, 1)
+        np.testing.assert_allclose(pixels_of(tmp_path / f"{k}.png", heed=True) / 65535, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(("names", "channels"), [
+    ("RGBA", 4), ("BGR", 3), (["R", "G", "B", "depth.Z"], 3), (["R", "G", "B", "A", "N.X", "N.Y"], 4),
+    (["View.Combined.R", "View.Combined.G", "View.Combined.B", "View.Combined.A", "View.Depth.Z"], 4),
+    (["View.Combined.B", "View.Combined.G", "View.Combined.R"], 3),
+])  # fmt: skip
+def test_colours_are_found_by_the_names_of_the_channels(tmp_path, names, channels):
+    exr_of(*names)(tmp_path / "a", stripes())
+    pixels = pixels_of(tmp_path / "a.exr")
+    order = [name.rpartition(".")[2] for name in names if name.rpartition(".")[2] in "RGB"]
+    assert pixels.shape == (H, W, channels)
+    np.testing.assert_allclose(pixels[..., :3], stripes()[..., [order.index(c) for c in "RGB"]], atol=1e-6)
+
+
+def test_associated_alpha_of_tiff_is_undone(tmp_path):
+    alpha = np.array([255, 128, 0, 60], np.uint8).repeat([9, 8, 7, 6])[None].repeat(H, 0)
+    colours = eight(stripes())
+    held = (colours * (alpha[..., None] / 255) + 0.5).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "a.tif", np.dstack([held, alpha]), photometric="rgb", extrasamples=["assocalpha"])
+    pixels = pixels_of(tmp_path / "a.tif")
+    np.testing.assert_allclose(pixels[:, :17, :3], colours[:, :17], atol=2)
+    assert (pixels[..., 3] == alpha).all()
+
+
 @pytest.mark.parametrize(("write", "pattern"), [
+    (by_tiff(photometric="cielab"), "its colours are CIELAB; save it as RGB"),
+    (by_tiff(photometric="ycbcr"), "its colours are YCBCR; save it as RGB"),
+    (lambda path, a: tifffile.imwrite(path.with_suffix(".tif"), np.stack([eight(a)] * 3), photometric="rgb"),
+     "has 3 pictures; save the photograph alone"),
+    (exr_of("N.X", "N.Y", "N.Z"), "has channels N.X, N.Y, N.Z, but no R, G, B"),
+    (exr_of("red", "green", "blue"), "but no R, G, B"), (exr_of("Z"), "has channels Z, but no R, G, B"),
+    (exr_of("a.R", "a.G", "a.B", "b.R", "b.G", "b.B"), "has the layers a, b; save the one of the photograph alone"),
+    (exr_window, r"its data window \(0, 0, 29, 21\) is not its display window \(0, 0, 99, 99\)"),
+    (png16((b"cICP", bytes([9, 16, 0, 1]))), "its colours are PQ, of HDR; save it as sRGB"),
+    (coded(".avif", 9, 18), "its colours are HLG, of HDR; save it as sRGB"),
     (tiff(lambda a: (a * 1e6).astype(np.int32)), "has int32 pixels, whose full scale is unknown"),
     (tiff(lambda a: np.repeat(eight(a), 2, 2)[..., :4], photometric="separated"), "CMYK; save it as RGB"),
     (lambda path, a: Image.fromarray(eight(a)).convert("CMYK").save(path.with_suffix(".jpg")), "CMYK; save it as RGB"),
@@ -234,8 +469,10 @@ def test_unknown_fields_are_named_once_and_unknown_lenses_refused(tmp_path, caps
     source = transforms(tmp_path / "a", {"fl_x": 70.0, "aabb_scale": 4}, frames, lambda k: eight(stripes()))
     converted("transforms", source, tmp_path / "a.xml")
     printed = capsys.readouterr().out
-    assert "not used, because unknown: lens_shift\n" in printed
+    assert "not used: lens_shift (unknown)\n" in printed
     frames[1]["rolling_shutter"] = [0, 0, 0.1, 0]
     source = transforms(tmp_path / "b", {"fl_x": 70.0}, frames, lambda k: eight(stripes()))
-    with pytest.raises(InputError, match=r"frames\[1\].rolling_shutter: is .*; such lenses are not supported"):
+    with pytest.raises(
+        InputError, match=r"frames\[1\].rolling_shutter: is .*, which is not supported: a camera that moved"
+    ):
         converted("transforms", source, tmp_path / "b.xml")

@@ -213,7 +213,7 @@ def test_meshrooms_poses_without_a_position_and_unknown_fields(tmp_path):
     path.write_text(path.read_text().replace('"rotationOnly": "False"', '"rotationOnly": "True"', 1))
     source = SfmData(path, Path())
     assert len(taken(source)) == 2 and source.without_pose == {"a.JPG", "lost.png"}
-    assert source.notes == [f"{path}: not used, because unknown: shear, bend"]
+    assert source.notes == [f"{path}: not used: intrinsics/shear (unknown), intrinsics/bend (unknown)"]
 
 
 @pytest.mark.parametrize(("kinds", "nested"), [

@@ -79,7 +79,8 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
         shutil.rmtree(out / name, ignore_errors=True)
     (out / "work/masks/03.png").unlink()  # of no use
     photos.main([str(folder), str(out)])
-    assert "Masks: of 19 of 20 photographs" in capsys.readouterr().out
+    assert "Masks: of 19 of 20 photographs" in (printed := capsys.readouterr().out)
+    assert "Assumed: 20 files of 8 bits are sRGB\n" in printed
     assert len(load_capture(out / "scene.xml")) == 19
     (folder / "07.png").unlink()
     (out / "scene.xml").unlink()

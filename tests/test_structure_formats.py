@@ -156,7 +156,7 @@ def test_unknown_fields_of_opensfm_are_named_once(tmp_path):
 
     source = OpenSfm(structure_files.opensfm(tmp_path, edit=edit), Path())
     taken(source)
-    assert source.notes[1:] == [f"{source.src}: not used, because unknown: shear, k3"]
+    assert source.notes[1:] == [f"{source.src}: not used: shots/shear (unknown), cameras/perspective/k3 (unknown)"]
 
 
 @pytest.mark.parametrize(("edit", "pattern"), [
@@ -258,7 +258,7 @@ def test_unknown_fields_of_polycam_are_named_once(tmp_path):
         structure_files.polycam(tmp_path, edit=lambda own: [camera.update(k1=0) for camera in own]), Path()
     )
     taken(source)
-    assert source.notes == [f"{tmp_path}/keyframes/corrected_cameras: not used, because unknown: k1"]
+    assert source.notes == [f"{tmp_path}/keyframes/corrected_cameras: not used: k1 (unknown)"]
 
 
 # Record3D
@@ -318,7 +318,7 @@ def test_a_camera_without_an_aspect_ratio_has_that_of_its_photograph(tmp_path):
 
     source = GltfCameras(structure_files.gltf(tmp_path, edit=edit), Path())
     agree(sorted(taken(source), key=lambda frame: frame.image), map(structure_files.gltf_pixels, range(3)))
-    assert source.notes == [f"{source.src}: not used, because unknown: KHR_lights_punctual"]
+    assert source.notes == [f"{source.src}: not used: KHR_lights_punctual (the light is where the options say)"]
 
 
 @pytest.mark.parametrize(("edit", "pattern"), [

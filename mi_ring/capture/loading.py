@@ -17,7 +17,7 @@ from mi_ring.capture.decoding import read_mask, read_photograph, require_header
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.capture.reduction import reduced
 from mi_ring.errors import InputError, SceneError, require_file
-from mi_ring.images import HEIF, PLAIN, RAW
+from mi_ring.image_headers import HEIF, PLAIN, RAW
 from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.spherical_harmonics import room_of

@@ -1,6 +1,7 @@
 """Meshes from files."""
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,20 @@ import trimesh
 from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
 
+JSON = 2**24  #: bytes at the beginning of a glTF file in which its extensions are looked for
+
 
 def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
     """Read a mesh from a file and close its seams. Raises InputError, which names the `field`, if that fails."""
     require_file(path, "the file of a mesh", field)
     with reading(f"{path}: {field}", "a mesh"):
-        content = io.BytesIO(path.read_bytes())  # a damaged file cannot request more bytes than this has
+        data = path.read_bytes()
+        needed = b" ".join(re.findall(rb'"extensionsRequired"\s*:\s*\[([^\]]*)\]', data[:JSON])).decode("latin-1")
+        if path.suffix.lower() in (".glb", ".gltf") and (packed := re.search(r"\w*(draco|meshopt)\w*", needed)):
+            raise InputError(f"{path}: {field}: is compressed by {packed[0]}; export it without compression")
+        if path.suffix.lower().lstrip(".") not in trimesh.exchange.load.mesh_formats():
+            raise InputError(f"{path}: {field}: is no mesh in a format that is read; save it as PLY, OBJ, STL or GLB")
+        content = io.BytesIO(data)  # a damaged file cannot request more bytes than this has
         resolver = trimesh.resolvers.FilePathResolver(str(path))
         mesh: Any = trimesh.load(content, path.suffix, resolver=resolver, force="mesh", process=False)
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and flat shading split vertices

@@ -1,10 +1,4 @@
-"""Bundler's cameras, which other programs write too.
-
-Fields:
-
-- used: f, k1, k2 (a camera with f = 0 has no pose); R, t (world to camera, which looks along -z, y up)
-- harmless: points; focal lengths in list.txt, where the program began
-"""
+"""Bundler's cameras, which other programs write too."""
 
 import re
 from collections.abc import Iterator
@@ -15,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import camera_to_world, opencv_lens
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -33,6 +28,11 @@ class Bundler(Photogrammetry):
     pot.bundle.out in pot.list.txt, beside SRC or above it. The file gives no sizes: the photographs must have their
     original size.
     """
+
+    fields = Fields(
+        used={"f k1 k2": "lens; a camera with f = 0 has no pose", "R t": "world to camera, which looks along -z, y up"},
+        harmless={"points": "the surface starts from masks", "list.txt:focal": "where the program began"},
+    )
 
     @property
     def cameras(self) -> Path:

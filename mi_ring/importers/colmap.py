@@ -7,6 +7,7 @@ from os.path import splitext
 from pathlib import Path
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.foreign import require_readable
 from mi_ring.importers.camera_models import Lens, camera_to_world
 from mi_ring.importers.frames import Frame
@@ -30,6 +31,18 @@ class Colmap(Photogrammetry):
     SRC is the folder of the model (cameras, images), or a folder with models in sparse/0, sparse/1, … or sparse. Of
     several the one with the most photographs is taken.
     """
+
+    fields = Fields(
+        used={
+            "cameras/CAMERA_ID cameras/MODEL cameras/WIDTH cameras/HEIGHT cameras/PARAMS[]": "lenses",
+            "images/QW images/QX images/QY images/QZ images/TX images/TY images/TZ": "poses, world-to-camera",
+            "images/CAMERA_ID images/NAME images/IMAGE_ID": "lens and photograph",
+            "rigs/RIG_ID rigs/REF_SENSOR_TYPE rigs/SENSORS[] frames/FRAME_ID frames/RIG_FROM_WORLD[]":
+                "cameras that are joined; pycolmap composes their poses",
+        },
+        refused={"cameras/MODEL=EQUIRECTANGULAR": "panoramas"},
+        harmless={"images/POINTS2D[] points3D/POINT3D_ID": "points: the surface starts from masks"},
+    )  # fmt: skip
 
     @staticmethod
     def model(src: Path) -> Path | None:

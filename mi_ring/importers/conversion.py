@@ -3,18 +3,26 @@
 import contextlib
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
-from mi_ring.colour_profiles import Statement
 from mi_ring.errors import InputError
-from mi_ring.images import bits_of, statement_of
+from mi_ring.image_fields import unused_fields
+from mi_ring.image_headers import KINDS, encodings
 from mi_ring.importers.frames import Frame, Source, adapt_all, frames_of, require_frames
 from mi_ring.importers.named_photographs import counted, few
 from mi_ring.importers.photograph_files import parts_of, stem_of
+from mi_ring.importers.reading import read_as
 from mi_ring.importers.writer import Writer, write_frame
 from mi_ring.scene.shot import Shot
 from mi_ring.system.progress import progress
+
+#: Suffixes of pictures that are not read.
+UNREAD = {
+    ".hdr", ".pfm", ".jp2", ".jxl", ".jxr", ".gif", ".psd", ".tga", ".ppm", ".pgm", ".pnm", ".npy", ".mat", ".mp4",
+    ".mov", ".raw", ".rwl", ".pef", ".srw", ".x3f", ".3fr", ".iiq",
+}  # fmt: skip
 
 
 def write_scene(source: Source) -> list[Frame]:
@@ -54,20 +62,24 @@ def require_most(source: Source, frames: Sequence[Frame]) -> None:
     if source.without_pose and not frames and not source.without_photograph:
         raise InputError(f"{source.src}: SRC: none of {len(source.without_pose)} photographs has a pose")
     if (lost := len(source.without_photograph)) > len(frames):
+        other = unread(source) or "give --images, the folder of the photographs"
         raise InputError(f"{source.src}: SRC: {lost} of {lost + len(frames)} cameras have no photograph in "
-                         f"{source.folder}: {few(source.without_photograph)}; give --images, the folder of the "
-                         "photographs")  # fmt: skip
+                         f"{source.folder}: {few(source.without_photograph)}; {other}")  # fmt: skip
+
+
+def unread(source: Source) -> str:
+    """A clause for the user if cameras without a photograph have a file of another kind; empty if they have none."""
+    stems = {stem_of(parts_of(name)[-1]) for name in source.without_photograph if parts_of(name)}
+    found = (file for file in source.folder.rglob("[!.]*") if stem_of(file.name.lower()) in stems)
+    kinds = {file.suffix.lower() for file in found if file.is_file()} & UNREAD
+    return f"files {', '.join(sorted(kinds))} there are not read; give {KINDS}" if kinds else ""
 
 
 def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
     """What the scene file takes for granted: encoding, lens, light and exposure."""
     given = [source.encoding if source.encoding != "auto" else frame.encoding for frame in frames]
     files = [frame.image for frame, encoding in zip(frames, given) if encoding == "auto" and frame.pixels is None]
-    bits = Counter(bits_of(file) for file in files)
-    profiles = sum(statement_of(file) != Statement() for file in files)
-    found = [f"{bits[8]} files of 8 bits are sRGB"] if bits[8] else []
-    found += [f"{more} files of more bits are linear"] if (more := len(files) - bits[8]) else []
-    found += [f"except as {profiles} of the files say themselves"] if profiles else []
+    found = encodings(files)
     found += [f"photographs are {what}, as said" for what in sorted({*given} - {"auto"})]
     curved = sum(not frame.lens.is_pinhole for frame in frames)
     found.append(f"distortion removed from {curved} photographs" if curved else "no lens distortion")
@@ -80,6 +92,12 @@ def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
     return found
 
 
+def unused_in(files: Iterable[Path]) -> list[str]:
+    """What image files say that is not used, a sentence for each field."""
+    found = Counter(f"{name} ({why})" for file in files for name, why in read_as(file, "image", unused_fields).items())
+    return [f"Not used in {count} photographs: {' '.join(what.split())[:99]}" for what, count in found.most_common(5)]
+
+
 def report(source: Source, frames: Sequence[Frame]) -> str:
     """What was left out and why, what was used, and what was assumed: one line each."""
     lines = list(source.notes)
@@ -89,7 +107,9 @@ def report(source: Source, frames: Sequence[Frame]) -> str:
                      f"{few(source.without_pose)}")  # fmt: skip
     if source.without_photograph:
         lines.append(f"{counted(source.without_photograph, 'camera')} left out, without a photograph in "
-                     f"{source.folder}: {few(source.without_photograph)}")  # fmt: skip
+                     f"{source.folder}: {few(source.without_photograph)}"
+                     + (f"; {other}" if (other := unread(source)) else ""))  # fmt: skip
+    lines.extend(unused_in(frame.image for frame in frames if frame.pixels is None))
     used = {frame.image for frame in frames} | {frame.mask for frame in frames}
     posed = {stem_of(parts_of(name)[-1]) for name in source.without_pose if parts_of(name)}
     if unused := [f.name for f in source.available if f not in used and stem_of(parts_of(f.name)[-1]) not in posed]:

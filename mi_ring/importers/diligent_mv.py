@@ -4,7 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
 from mi_ring.importers.frames import OPENGL, Frame, Light, Source
 from mi_ring.importers.reading import chosen, entry, existing, image_size, load_mat, load_table
@@ -16,6 +19,22 @@ class DiligentMV(Source):
 
     SRC is the folder of an object, such as mvpmsData/bearPNG, with Calib_Results.mat, view_01, view_02, …
     """
+
+    fields = Fields(
+        used={
+            "KK": "calibration matrix", "Rc_* Tc_*": "poses, world-to-camera",
+            "light_directions.txt light_intensities.txt": "lights", "mask.png": "masks", "mesh_Gt.ply": "the truth",
+        },
+        told={"kc alpha_c": "distortion and skew, where they are not 0"},
+        harmless={
+            "fc cc inv_KK omc_* H_*": "the same as other fields",
+            "fc_error cc_error kc_error alpha_c_error omc_error_* Tc_error_* err_std ex_* ex": "errors",
+            "x_* y_* X_* Y_* dX* dY* n_sq_x* n_sq_y* wintx* winty* nx ny map": "the pattern that calibrated the camera",
+            "n_ima active_images ind_active image_numbers calib_name format_image type_numbering": "its pictures",
+            "first_num N_slots solution* param* est_* center_optim check_cond MaxIter recompute_extrinsic": "settings",
+            "__*": "the head of the file", "normal_gt.* *.jpg filenames.txt": "other files",
+        },
+    )  # fmt: skip
 
     views: tuple[int, ...] = ()
     """Numbers of the views to take, from 1. Without it: all."""
@@ -31,6 +50,7 @@ class DiligentMV(Source):
         numbers = {int(f.name[5:]): f for f in self.src.glob("view_*") if f.name[5:].isdigit()}
         if not numbers:
             raise InputError(f"{self.src}: SRC: no folders view_01, view_02, …; give the folder of one object")
+        self.tell_unused(file, [k for k, v in calibration.items() if k not in ("kc", "alpha_c") or np.any(v)])
         K = entry(calibration, "KK", (3, 3), file)
         for view in chosen(self.views, numbers, "--views", self.src):
             folder = numbers[view]

@@ -5,13 +5,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 from tyro.conf import Positional, Suppress, arg
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.geometry.camera import Camera
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.reading import image_size, orientation_of
@@ -53,6 +54,8 @@ class Frame:
 class Source:
     """The base class of all importers, with the options that all formats share."""
 
+    fields: ClassVar[Fields]  #: of the format
+
     src: Positional[Annotated[Path, arg(metavar="SRC")]]
     """The other tool's data: a file or a folder."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
@@ -86,10 +89,11 @@ class Source:
         """Sentences for the user about what was chosen or not used. Complete when all `frames` have been read."""
         return []
 
-    def note_unknown(self, path: Path, fields: Iterable[str]) -> None:
-        """Note the fields of a file that are neither used nor known to be harmless; each is named once."""
-        if names := ", ".join(dict.fromkeys(" ".join(name.split())[:40] for name in fields)):
-            self.notes.append(f"{path}: not used, because unknown: {names}")
+    def tell_unused(self, file: Path, names: Iterable[str]) -> None:
+        """Add a note about the fields in a file, by their `names`, that are neither used nor harmless."""
+        if unused := self.fields.unused(names):
+            words = [f"{' '.join(name.split())[:60]} ({why})" for name, why in unused.items()]
+            self.notes.append(f"{file}: not used: {', '.join(words[:9])}{', …' * (len(words) > 9)}")
 
     @property
     def folder(self) -> Path:

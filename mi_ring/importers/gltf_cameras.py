@@ -1,12 +1,4 @@
-"""Cameras in glTF files, as Blender exports them.
-
-Fields:
-
-- used: name, camera, children, matrix, translation, rotation and scale of nodes; name, yfov and aspectRatio of cameras
-- refused: orthographic cameras
-- noted: extensions of lights; the light is where the options say
-- harmless: znear and zfar of cameras; meshes, materials, textures, animations
-"""
+"""Cameras in glTF files, as Blender exports them."""
 
 import math
 from collections.abc import Iterator
@@ -18,6 +10,7 @@ import pygltflib
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -35,6 +28,20 @@ class GltfCameras(Photogrammetry):
     SRC is the .gltf or .glb. A photograph has the name of its camera's object, or of its camera. glTF has neither lens
     distortion nor a shift of the lens: the principal point is in the middle.
     """
+
+    fields = Fields(
+        used={
+            "nodes/name nodes/camera nodes/children cameras/name": "photographs",
+            "nodes/matrix nodes/translation nodes/rotation nodes/scale": "poses",
+            "perspective/yfov perspective/aspectRatio": "lenses",
+        },
+        refused={"cameras/type=orthographic": "lenses without perspective"},
+        told={"KHR_lights_*": "the light is where the options say"},
+        harmless={
+            "perspective/znear perspective/zfar": "the range of depth",
+            "meshes/* materials/* textures/* animations/* skins/* buffers/*": "the scene",
+        },
+    )
 
     def posed(self) -> Iterator[Frame]:
         gltf = read_gltf(self.src)
@@ -57,7 +64,7 @@ class GltfCameras(Photogrammetry):
             if camera.perspective is None:
                 raise InputError(f"{what}: type: is {str(camera.type)!r}; must be perspective")
             yield Frame(image, lens_of(camera.perspective, image, what), rigid(placed[k], what) @ OPENGL, said=name)
-        self.note_unknown(self.src, (str(name) for name in gltf.extensionsUsed or () if "lights" in str(name)))
+        self.tell_unused(self.src, (str(name) for name in gltf.extensionsUsed or () if "lights" in str(name)))
 
 
 def read_gltf(path: Path) -> pygltflib.GLTF2:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.named_photographs import NamedPhotographs
@@ -17,6 +18,8 @@ class Iron(NamedPhotographs):
 
     SRC is that folder, or a folder that has it as train.
     """
+
+    fields = Fields(used={"K": "calibration matrix", "W2C": "pose, world-to-camera", "img_size": "of the photograph"})
 
     @property
     def cameras(self) -> Path:
@@ -32,6 +35,7 @@ class Iron(NamedPhotographs):
         cameras = load_json(path)
         if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
             raise InputError(f"{path}: must be an object with an object K, W2C, img_size for each photograph")
+        self.tell_unused(path, (name for camera in cameras.values() for name in camera))
         for key in sorted(cameras):  # the keys end in .png, but the files may have another suffix
             if (image := self.photograph(key, f"{path}: {key}")) is None:
                 continue

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.foreign import load_npy
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import Frame
@@ -20,6 +21,11 @@ class Llff(Photogrammetry):
     SRC is the folder of poses_bounds.npy. The photographs are in the first folder of images; sorted by name, they have
     the order of the poses.
     """
+
+    fields = Fields(
+        used={"rotation translation": "poses, camera-to-world; axes down, right, back", "height width focal": "lenses"},
+        harmless={"near far": "the range of depth"},
+    )
 
     def posed(self) -> Iterator[Frame]:
         path = existing(self.src / "poses_bounds.npy", "SRC")

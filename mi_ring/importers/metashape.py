@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields, xml_names
 from mi_ring.geometry.camera import moved_pose
 from mi_ring.importers.camera_models import Lens, opencv_lens
 from mi_ring.importers.frames import Frame
@@ -25,11 +26,50 @@ class Metashape(Photogrammetry):
     pose. A camera of a rig has the pose of its master, moved by location and rotation of its sensor.
     """
 
+    fields = Fields(
+        used={
+            "sensor@id sensor@type sensor/calibration calibration@type calibration@class": "lenses: frame or fisheye",
+            "sensor/resolution calibration/resolution resolution@width resolution@height": "size of the photographs",
+            "calibration/f calibration/cx calibration/cy calibration/b1": "intrinsics",
+            "calibration/k[1-4] calibration/p[12]": "distortion",
+            "camera@label camera@sensor_id camera@component_id": "photograph, lens and place in the world",
+            "camera/transform": "pose, camera-to-world",
+            "camera@master_id sensor@master_id sensor/rotation/* sensor/location/*": "rigs: the place by the master",
+            "camera@enabled": "disabled photographs are left out",
+            "component@id component/transform chunk/transform": "from the chunk to the world",
+            "transform/rotation transform/translation transform/scale": "from the chunk to the world",
+            "chunk/sensors sensors/sensor chunk/cameras cameras/camera": "hold the others",
+            "cameras/group group/camera chunk/components components/component": "hold the others",
+        },
+        refused={
+            "calibration/b2": "skew of more than 0.1 px",
+            "calibration/p[34]": "tangential terms that OpenCV does not have",
+            "sensor/property:rolling_shutter": "cameras that moved during the exposure",
+        },
+        told={
+            "sensor/vignetting/*": "brightness of the corners; a fit may refine it",
+            "sensor/corrections/*": "distortion beyond the model",
+            "sensor/property:film_camera": "scanned film with marks",
+        },
+        harmless={
+            "*@label *@next_id *@next_group_id *@active_id": "names and counters",
+            "chunk@* camera@id camera@type group@* *@locked": "names and settings",
+            "camera/rotation_covariance camera/location_covariance sensor/covariance/*": "errors",
+            "camera/orientation": "how the camera was held; pixels are as stored",
+            "camera/reference/* chunk/reference/* component/region/* component/reference/*": "measured places",
+            "camera/photo/* camera/meta/* sensor/meta/* sensor/property:*": "EXIF data and settings",
+            "sensor/bands/* sensor/data_type sensor/black_level sensor/sensitivity": "the sensor",
+            "chunk/frames/* chunk/images/* chunk/masks/* chunk/markers/* chunk/scalebars/*": "other data of the chunk",
+            "chunk/region/* chunk/settings/* chunk/meta/* component/partition/*": "other data of the chunk",
+        },
+    )
+
     def posed(self) -> Iterator[Frame]:
         chunk = find_chunk(load_xml(self.src))
         if chunk is None:
             raise InputError(f"{self.src}: SRC: is no <document> with a <chunk>; must be what File > Export > Export "
                              "Cameras of Metashape writes as Agisoft XML")  # fmt: skip
+        self.tell_unused(self.src, xml_names(chunk, self.fields.closed))
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
         components = {component.get("id"): component for component in chunk.iterfind("components/component")}
         cameras = {camera.get("id"): camera for camera in chunk.iterfind("cameras//camera")}
@@ -115,6 +155,9 @@ def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
     if sensor.get("type", "frame") not in KINDS:  # a panorama has no calibration
         raise InputError(f"{what}: type: is {sensor.get('type')!r}; must be frame or fisheye; leave such "
                          "photographs out")  # fmt: skip
+    if sensor.find("property[@name='rolling_shutter'][@value='true']") is not None:
+        raise InputError(f"{what}: rolling_shutter: is true, which is not supported; align without rolling shutter "
+                         "compensation")  # fmt: skip
     calibration = sensor.find("calibration[@class='adjusted']")
     if calibration is None:
         calibration = sensor.find("calibration")

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -16,6 +17,11 @@ class Middlebury(Photogrammetry):
 
     SRC is that file or its folder.
     """
+
+    fields = Fields(used={
+        "imgname": "the photograph", "k11 k12 k13 k21 k22 k23 k31 k32 k33": "calibration matrix, without skew",
+        "r11 r12 r13 r21 r22 r23 r31 r32 r33 t1 t2 t3": "pose, world-to-camera",
+    })  # fmt: skip
 
     def posed(self) -> Iterator[Frame]:
         files = sorted(self.src.glob("*_par.txt")) if self.src.is_dir() else [self.src]

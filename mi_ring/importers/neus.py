@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.foreign import load_npy, load_npz
 from mi_ring.importers.camera_models import decompose_projection, pinhole_lens
 from mi_ring.importers.frames import Frame, Source
@@ -20,9 +21,21 @@ class Neus(Source):
     SRC is the folder. WildLight's light_energy_* become intensities; its photographs without flash are left out.
     """
 
+    fields = Fields(
+        used={
+            "world_mat_*": "projection matrices", "scale_mat_*": "the unit of light_energy_*",
+            "light_energy_*": "WildLight: intensity of the flash", "max_intensity": "WildLight: where pixels clip",
+        },
+        harmless={
+            "world_mat_inv_* scale_mat_inv_*": "inverses of other fields",
+            "camera_mat_* camera_mat_inv_*": "parts of world_mat_*",
+        },
+    )  # fmt: skip
+
     def frames(self) -> Iterator[Frame]:
         path = first_file([self.src / "cameras_sphere.npz", self.src / "cameras.npz"], "SRC")
         cameras = load_npz(path)
+        self.tell_unused(path, cameras)
         numbers = sorted(int(key[10:]) for key in cameras if re.fullmatch(r"world_mat_\d+", key))
         images, array = numbered_images(self.src / "image"), self.src / "images.npy"
         if array.is_file():

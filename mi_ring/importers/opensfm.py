@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -20,17 +21,6 @@ TERMS = {
     "perspective": ("k1", "k2"), "simple_radial": ("k1",), "radial": ("k1", "k2"),
     "brown": ("k1", "k2", "k3", "p1", "p2"), "fisheye": ("k1", "k2"), "fisheye_opencv": ("k1", "k2", "k3", "k4"),
 }  # fmt: skip
-#: Other fields of cameras that are used. The same with `_prior` change nothing: what the program began with.
-CAMERA = {"projection_type", "width", "height", "focal", "focal_x", "focal_y", "c_x", "c_y"}
-#: Fields of shots that are used, and those that change nothing: poses are in the frame of the reconstruction already.
-SHOT = {"rotation", "translation", "camera"} | {
-    "orientation", "capture_time", "gps_dop", "gps_position", "gps_altitude", "compass", "accelerometer", "opk",
-    "skey", "scale", "covariance", "merge_cc", "vertices", "faces", "is_interpolated",
-}  # fmt: skip
-#: Fields of reconstructions that are used, and those that change nothing: points, and what the poses contain already.
-TOP = {"cameras", "shots"} | {
-    "points", "biases", "rig_cameras", "rig_instances", "reference_lla", "reference", "main_shots", "pano_shots",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,6 +30,24 @@ class OpenSfm(Photogrammetry):
     SRC is the file, or a folder with reconstruction.json or opensfm/reconstruction.json. Of several reconstructions the
     one with the most photographs is taken.
     """
+
+    fields = Fields(
+        used={
+            "cameras shots": "hold the others", "shots/rotation shots/translation shots/camera": "pose",
+            "cameras/projection_type cameras/width cameras/height": "kind of lens, and size",
+            "cameras/focal cameras/focal_x cameras/focal_y cameras/c_x cameras/c_y": "intrinsics",
+            "cameras/k[1-4] cameras/p[12]": "distortion, of the kinds of lens that have it",
+        },
+        refused={"cameras/projection_type=*": "panoramas, and lenses of their own: dual, fisheye62"},
+        harmless={
+            "points biases reference_lla reference main_shots pano_shots": "points, and what poses contain already",
+            "rig_cameras rig_instances": "poses of photographs contain those of rigs",
+            "cameras/*_prior": "what the program began with",
+            "shots/orientation shots/capture_time shots/gps_* shots/compass shots/accelerometer shots/opk": "sensors",
+            "shots/skey shots/scale shots/covariance shots/merge_cc shots/vertices shots/faces shots/is_interpolated":
+                "of the program",
+        },
+    )  # fmt: skip
 
     @property
     def cameras(self) -> Path:
@@ -61,19 +69,20 @@ class OpenSfm(Photogrammetry):
         shots = [require_object(own.get("shots"), f"{path}: [{k}].shots") for k, own in enumerate(models)]
         best = self.largest(shots, "reconstructions")
         cameras = require_object(models[best].get("cameras"), f"{path}: [{best}].cameras")
-        unknown = [name for name in models[best] if name not in TOP]
+        names = [*models[best]]
         for name, shot in sorted(shots[best].items()):
             what = f"{path}: shots {name[:99]!r}"
             turn = matrix(require_object(shot, what).get("rotation"), (3,), f"{what}.rotation")
             shift = matrix(shot.get("translation"), (3,), f"{what}.translation")
-            unknown += [key for key in shot if key not in SHOT]
+            names += [f"shots/{key}" for key in shot]
             if image := self.photograph(name, what):
                 camera = require_object(cameras.get(str(shot.get("camera"))), f"{what}.camera")
                 lens = opensfm_lens(camera, image, f"{path}: cameras {str(shot['camera'])[:99]!r}")
-                known = CAMERA.union(TERMS[camera.get("projection_type", "perspective")])
-                unknown += [key for key in camera if key.removesuffix("_prior") not in known]
+                kind = str(camera.get("projection_type", "perspective"))
+                terms = {term for own in TERMS.values() for term in own}.difference(TERMS[kind])  # of other kinds
+                names += [f"cameras/{kind}/{key}" if key in terms else f"cameras/{key}" for key in camera]
                 yield Frame(image, lens, camera_to_world(Rotation.from_rotvec(turn).as_matrix(), shift), said=name)
-        self.note_unknown(path, unknown)
+        self.tell_unused(path, names)
 
 
 def opensfm_lens(given: dict[str, Any], image: Path, what: str) -> Lens:

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import ExifTags
 
 from mi_ring.errors import InputError
-from mi_ring.images import exif_of
+from mi_ring.image_headers import exif_of
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.named_photographs import NamedPhotographs
 from mi_ring.importers.reading import read_as

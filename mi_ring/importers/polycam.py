@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -15,8 +16,6 @@ from mi_ring.importers.reading import load_json, matrix, require_object
 
 #: Fields that are used: entries of the camera-to-world matrix by row and column, and the lens [px].
 USED = [*(f"t_{row}{column}" for row in range(3) for column in range(4)), "fx", "fy", "cx", "cy", "width", "height"]
-#: Fields that change nothing: how good a picture is, and what is near it.
-HARMLESS = {"timestamp", "blur_score", "neighbors", "manual_keyframe", "center_depth", "angular_velocity"}
 
 
 @dataclass(frozen=True)
@@ -26,6 +25,13 @@ class Polycam(Photogrammetry):
     SRC is the folder of the export, or its folder keyframes. The corrected cameras and images are taken, if there are
     any. The camera looks along -z, y is up; y of the world is up.
     """
+
+    fields = Fields(
+        used={
+            "t_[0-2][0-3]": "pose, camera-to-world", "fx fy cx cy": "lens", "width height": "size of the photograph",
+        },
+        harmless={"timestamp blur_score neighbors manual_keyframe center_depth angular_velocity": "its quality"},
+    )  # fmt: skip
 
     @property
     def corrected(self) -> str:
@@ -49,7 +55,7 @@ class Polycam(Photogrammetry):
         if not self.corrected:
             self.notes.append(f"{folder}: Polycam has not corrected these cameras; they are those of the phone, which "
                               "are less exact")  # fmt: skip
-        unknown: list[str] = []
+        names: list[str] = []
         for path in files:
             given = require_object(load_json(path), str(path))
             if (image := self.photograph(f"{path.stem}.jpg", str(path))) is None:
@@ -57,7 +63,7 @@ class Polycam(Photogrammetry):
             numbers = [float(matrix(given.get(name), (), f"{path}: {name}")) for name in USED]
             pose = np.vstack([np.reshape(numbers[:12], (3, 4)), [0, 0, 0, 1]])
             size: Any = numbers[16:]
-            unknown += [name for name in given if name not in HARMLESS.union(USED)]
+            names += given
             lens = Lens("PINHOLE", size, tuple(numbers[12:16]))  # Lens truncates
             yield Frame(image, lens, pose @ OPENGL, said=f"{path.stem}.jpg")
-        self.note_unknown(folder, unknown)
+        self.tell_unused(folder, names)

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.io
 from PIL import ExifTags
 
-from mi_ring import images
+from mi_ring import image_headers, images
 from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading, require_readable
 
@@ -31,24 +31,24 @@ def pixels_of(path: Path, heed: bool = False) -> np.ndarray:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Read the width and height [px] of an image file."""
-    return read_as(path, "image", images.image_size)
+    return read_as(path, "image", image_headers.image_size)
 
 
 def orientation_of(path: Path) -> int:
     """The EXIF orientation by which the pixels that we read are to be turned; 1 if there is none."""
-    if path.suffix.lower() in (*images.HEIF, *images.RAW):  # their readers turn them
+    if path.suffix.lower() in (*image_headers.HEIF, *image_headers.RAW):  # their readers turn them
         return 1
-    value = read_as(path, "image", images.exif_of).get(ExifTags.Base.Orientation)
+    value = read_as(path, "image", image_headers.exif_of).get(ExifTags.Base.Orientation)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 def has_alpha(path: Path) -> bool:
     """Does an image file have an alpha channel that is not opaque everywhere?"""
     suffix = path.suffix.lower()
-    if suffix not in (".exr", *images.TIFF):
-        if suffix in (".jpg", ".jpeg", *images.RAW):
+    if suffix not in (".exr", *image_headers.TIFF):
+        if suffix in (".jpg", ".jpeg", *image_headers.RAW):
             return False
-        with reading(path, "image"), images.open_image(existing(path, "image")) as image:
+        with reading(path, "image"), image_headers.open_image(existing(path, "image")) as image:
             if not image.has_transparency_data:
                 return False
     pixels = pixels_of(path)
@@ -86,14 +86,15 @@ def images_below(folder: Path) -> list[Path]:
 
 def is_image(path: Path) -> bool:
     """Is there such a file, with a suffix of image files?"""
-    return path.suffix.lower() in images.SUFFIXES and is_file(path)
+    return path.suffix.lower() in image_headers.SUFFIXES and is_file(path)
 
 
 def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
     """The paths, sorted, without raw files and HEIC beside an image of another format with the same name."""
     found = sorted(paths)
-    others = {path.with_suffix("") for path in found if path.suffix.lower() not in images.RAW + images.HEIF}
-    return [p for p in found if p.with_suffix("") not in others or p.suffix.lower() not in images.RAW + images.HEIF]
+    twins = image_headers.RAW + image_headers.HEIF
+    others = {path.with_suffix("") for path in found if path.suffix.lower() not in twins}
+    return [p for p in found if p.with_suffix("") not in others or p.suffix.lower() not in twins]
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
@@ -154,9 +155,21 @@ def load_xml(path: Path) -> ElementTree.Element:
     return read_as(path, "XML", lambda file: ElementTree.fromstring(file.read_bytes()))
 
 
-def load_lines(path: Path) -> list[str]:
-    """Read the lines of a text file, without empty ones."""
-    text = read_as(path, "text", lambda file: file.read_bytes().decode("utf-8-sig"))
+def load_lines(path: Path, others: bool = False) -> list[str]:
+    """Read the lines of a text file, without empty ones. `others`: it may be UTF-16, or Windows' Latin-1, too."""
+
+    def decoded(file: Path) -> str:
+        content = file.read_bytes()
+        if others and content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+            return content.decode("utf-16")
+        try:
+            return content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            if not others:
+                raise
+            return content.decode("cp1252")
+
+    text = read_as(path, "text", decoded)
     return [line for line in text.splitlines() if line.strip()]
 
 

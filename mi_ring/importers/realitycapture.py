@@ -1,6 +1,7 @@
 """RealityCapture's and RealityScan's cameras: XMP sidecars, or a table."""
 
 import csv
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -19,6 +21,7 @@ XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")  #: columns of a table [scene units, degrees]
 TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")  #: coefficients of the distortion
 NUMBERS = {*POSE, "f", "px", "py", *TERMS}  #: columns that hold numbers
+DECIMAL = re.compile(r"[-+\d]+,\d*([eE][-+]?\d+)?")  #: a number with a comma
 #: Distortion models, and the number of coefficients that each uses.
 BROWN = {"perspective": 0, "none": 0, "brown3": 3, "brown4": 4, "brown3t2": 6, "brown4t2": 6}
 
@@ -31,6 +34,26 @@ class RealityCapture(Photogrammetry):
     have one of the Brown models.
     """
 
+    fields = Fields(
+        used={
+            "xcr:Rotation xcr:Position": "pose, world-to-camera, and place",
+            "xcr:FocalLength35mm xcr:PrincipalPointU xcr:PrincipalPointV": "intrinsics",
+            "xcr:DistortionModel xcr:DistortionCoeficients": "distortion by the Brown models",
+            "name": "CSV: the photograph", "x y alt heading pitch roll": "CSV: pose",
+            "f px py k1 k2 k3 t1 t2": "CSV: lens",
+        },
+        refused={
+            "xcr:Skew xcr:AspectRatio": "pixels that are no squares", "k4": "a fourth radial term",
+            "xcr:DistortionModel=division": "division models",
+        },
+        harmless={
+            "xcr:PosePrior xcr:CalibrationPrior": "how far RealityCapture may change them",
+            "xcr:CalibrationGroup xcr:DistortionGroup xcr:Rig xcr:RigInstance xcr:RigPoseIndex": "groups of cameras",
+            "xcr:InTexturing xcr:InMeshing xcr:InColoring xcr:ComponentId xcr:Version": "settings",
+            "xcr:Coordinates xcr:latitude xcr:longitude xcr:altitude": "where the frame is on the earth",
+        },
+    )  # fmt: skip
+
     def posed(self) -> Iterator[Frame]:
         return self.from_sidecars() if self.src.is_dir() else self.from_csv()
 
@@ -40,13 +63,16 @@ class RealityCapture(Photogrammetry):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
         images = list_images(self.images or (self.src if list_images(self.src) else self.folder))
+        names: dict[str, None] = {}
         for image in images if self.photographs is None else self.photographs:
             path = self.src / f"{image.stem}.xmp"
             fields = xmp_fields(load_xml(path)) if path.is_file() else {}
+            names.update((f"xcr:{name}", None) for name in fields)
             if "Rotation" in fields and "Position" in fields:
                 yield sidecar_frame(image, fields, str(path))
             else:
                 self.without_pose.add(image.name)
+        self.tell_unused(self.src, names)
 
     def from_csv(self) -> Iterator[Frame]:
         """The photographs in the rows of a CSV file."""
@@ -54,6 +80,7 @@ class RealityCapture(Photogrammetry):
         if missing := [name for name in ("name", *POSE, "f") if name not in columns]:
             raise InputError(f"{self.src}: column {missing[0]}: is missing; must be the table of internal and external "
                              "camera parameters")  # fmt: skip
+        self.tell_unused(self.src, columns)
         for line, row in enumerate(rows, 1):
             what = f"{self.src}: camera {line}"
             if len(row) != len(columns):
@@ -107,12 +134,18 @@ def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
 
 
 def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Column names and rows of a CSV file. Its first line may be the number of cameras, which is skipped."""
-    lines = [line for line in load_lines(path) if not line.startswith("#cameras")]
+    """Column names and rows of a CSV file. Its first line may be the number of cameras, which is skipped.
+
+    Programs for tables may have saved it with semicolons or tabs, decimal commas, and in another encoding.
+    """
+    lines = [line for line in load_lines(path, others=True) if not line.startswith("#cameras")]
+    separator = max(",;\t", key=lines[0].count) if lines else ","
     try:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(lines)]
+        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]
     except csv.Error as error:
         raise InputError(f"{path}: cannot be read as a table ({error})") from error
+    if separator != ",":
+        rows = [[cell.replace(",", ".") if DECIMAL.fullmatch(cell) else cell for cell in row] for row in rows]
     return [name.lstrip("#").lower() for name in rows[0]] if rows else [], rows[1:]
 
 

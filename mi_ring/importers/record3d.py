@@ -8,15 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import list_images, load_json, matrix, require_object
-
-#: Fields that are used, and those that change nothing: depth maps, times, and the pose to which none is relative.
-KNOWN = {"K", "perFrameIntrinsicCoeffs", "w", "h", "poses"} | {
-    "dw", "dh", "fps", "initPose", "frameTimestamps", "cameraType", "depthScale",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -27,6 +23,14 @@ class Record3D(Photogrammetry):
     poses are quaternions x y z w and positions, camera to world; the camera looks along -z, y is up. The names of the
     photographs are the numbers of the poses.
     """
+
+    fields = Fields(
+        used={"K perFrameIntrinsicCoeffs w h": "lenses", "poses": "camera-to-world"},
+        harmless={
+            "dw dh depthScale": "depth maps", "fps frameTimestamps cameraType": "of the recording",
+            "initPose": "the poses are not relative to it",
+        },
+    )  # fmt: skip
 
     @property
     def folder(self) -> Path:
@@ -56,4 +60,4 @@ class Record3D(Photogrammetry):
                 pose = np.eye(4)
                 pose[:3, :3], pose[:3, 3] = Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:]
                 yield Frame(image, Lens("PINHOLE", (size[0], size[1]), tuple(params)), pose @ OPENGL, said=name)
-        self.note_unknown(path, (name for name in given if name not in KNOWN))
+        self.tell_unused(path, given)

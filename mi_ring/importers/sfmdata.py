@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields, json_names
 from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -17,19 +18,6 @@ from mi_ring.importers.reading import load_json, matrix, require_object
 MODELS = {
     "pinhole": 0, "none": 0, "radial1": 1, "radialk1": 1, "radial3": 3, "radialk3": 3, "brown": 5, "fisheye4": 4,
     "fisheye": 4, "pinhole_radial_k1": 1, "pinhole_radial_k3": 3, "pinhole_brown_t2": 5,
-}  # fmt: skip
-#: Fields of AliceVision that are used.
-USED = {
-    "path", "poseId", "viewId", "intrinsicId", "isPoseIndependant", "pose", "transform", "rotationOnly", "width",
-    "height", "type", "pxFocalLength", "focalLength", "sensorWidth", "pixelRatio", "principalPoint", "distortionType",
-    "distortionParams", "undistortionType",
-}  # fmt: skip
-#: Fields of AliceVision that change nothing: names, what the program began with and held fixed, earlier photographs.
-HARMLESS = {
-    "rigId", "subPoseId", "frameId", "resectionId", "metadata", "ancestors", "ancestorImages", "locked", "removable",
-    "sensorHeight", "serialNumber", "initializationMode", "initialFocalLength", "pxInitialFocalLength",
-    "pixelRatioLocked", "offsetLocked", "scaleLocked", "distortionLocked", "distortionInitializationMode",
-    "undistortionOffset", "undistortionParams",
 }  # fmt: skip
 COEFFICIENTS = ("disto_k1", "disto_k3", "disto_t2", "fisheye")  #: OpenMVG's fields of the coefficients
 
@@ -41,10 +29,51 @@ class SfmData(Photogrammetry):
     SRC is the file. It names the photographs; if they were moved, give --images.
     """
 
+    fields = Fields(
+        used={
+            "version": "Meshroom: which conventions hold",
+            "views/path views/poseId views/viewId views/intrinsicId": "Meshroom: photograph, pose and lens",
+            "poses/poseId poses/pose pose/transform transform/rotation transform/center": "Meshroom: camera-to-world",
+            "pose/rotationOnly": "Meshroom: such photographs have no place, and are left out",
+            "intrinsics/intrinsicId intrinsics/width intrinsics/height": "Meshroom: size of the photographs",
+            "intrinsics/sensorWidth intrinsics/focalLength intrinsics/pxFocalLength intrinsics/pixelRatio": "Meshroom",
+            "intrinsics/principalPoint": "Meshroom: intrinsics",
+            "intrinsics/type intrinsics/distortionType intrinsics/distortionParams": "Meshroom: distortion",
+            "root_path data/local_path data/filename data/id_intrinsic data/id_pose": "OpenMVG: photograph, lens, pose",
+            "value/rotation value/center": "OpenMVG: pose, world-to-camera",
+            "value/polymorphic_id value/polymorphic_name": "OpenMVG: the kind of lens",
+            "data/width data/height data/focal_length data/principal_point": "OpenMVG: intrinsics",
+            "value0/width value0/height value0/focal_length value0/principal_point": "OpenMVG: intrinsics",
+            "data/disto_k1 data/disto_k3 data/disto_t2 data/fisheye": "OpenMVG: distortion",
+            "views poses intrinsics extrinsics */key */value value/ptr_wrapper ptr_wrapper/data data/value0":
+                "hold the others",
+        },
+        refused={
+            "views/isPoseIndependant": "photographs of rigs",
+            "intrinsics/undistortionType": "a second model of the lens",
+        },
+        harmless={
+            "views/frameId views/resectionId views/rigId views/subPoseId views/ancestor* views/imageGroup*": "numbers",
+            "views/width views/height": "the size is the lens's",
+            "views/metadata/*": "EXIF data",
+            "pose/locked pose/removable intrinsics/*[lL]ocked": "settings",
+            "intrinsics/initial* intrinsics/pxInitialFocalLength intrinsics/distortionInitializationMode": "guesses",
+            "intrinsics/serialNumber intrinsics/sensorHeight": "the camera",
+            "intrinsics/undistortionOffset intrinsics/undistortionParams": "of undistortionType",
+            "intrinsics/fisheyeC* intrinsics/fisheyeR*": "where a fisheye's picture ends",
+            "rigs/*": "photographs of rigs are refused if they have no pose of their own",
+            "structure/* control_points/* controlPoints/* landmarks/* constraints*": "points",
+            "rotationpriors/* surveypoints/* featuresFolders matchesFolders": "of the alignment",
+            "sfm_data_version ptr_wrapper/id data/id_view": "numbers",
+            "data/use_pose_* data/center* data/rotation*": "measured places and directions",
+        },
+    )  # fmt: skip
+
     def posed(self) -> Iterator[Frame]:
         top = load_json(self.src)
         if not isinstance(top, dict) or not isinstance(top.get("views"), list):
             raise InputError(f"{self.src}: views: is missing; must be a scene of Meshroom or OpenMVG")
+        self.tell_unused(self.src, json_names(top, self.fields.closed))
         yield from self.openmvg(top) if "extrinsics" in top or "root_path" in top else self.alicevision(top)
 
     def alicevision(self, top: dict) -> Iterator[Frame]:
@@ -52,7 +81,6 @@ class SfmData(Photogrammetry):
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
         poses = self.by_key(top, "poses", "poseId")
-        unknown: list[str] = []
         for k, view in enumerate(top["views"]):
             what = f"{self.src}: views[{k}]"
             file = file_name(require_object(view, what), "path", what)
@@ -74,10 +102,7 @@ class SfmData(Photogrammetry):
             key = str(view.get("intrinsicId"))
             intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
             lens = alicevision_lens(intrinsic, version, f"{self.src}: intrinsic {key!r}")
-            unknown += [name for fields in (view, own, place, intrinsic) for name in fields
-                        if name not in USED | HARMLESS]  # fmt: skip
             yield from self.frame(file, lens, pose, what)
-        self.note_unknown(self.src, unknown)
 
     def openmvg(self, top: dict) -> Iterator[Frame]:
         """The photographs of a scene of OpenMVG. Its library cereal names a polymorphic type only at its first use."""

@@ -9,26 +9,11 @@ from typing import Any
 import numpy as np
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens, opencv_lens, pinhole_lens
 from mi_ring.importers.frames import OPENGL, Frame, Light
 from mi_ring.importers.named_photographs import NamedPhotographs
 from mi_ring.importers.reading import first_file, image_size, images_below, load_json, matrix
-
-#: Fields of the file and of its frames that are used.
-USED = {
-    "file_path", "img_path", "transform_matrix", "mask_path", "pl_pos", "pl_intensity", "w", "h", "fl_x", "fl_y", "cx",
-    "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "camera_intrinsics", "intrinsic_matrix", "from_na",
-    "camera_model", "is_fisheye", "k1", "k2", "k3", "k4", "p1", "p2",
-}  # fmt: skip
-#: Fields of lenses that are refused where they are not 0.
-REFUSED = ("rolling_shutter", "ftheta_p0", "lens_mode", "p3", "p4", "k5", "k6", "s1", "s2", "s3", "s4")
-#: Fields that change nothing: the place of the scene in instant-ngp's box, other maps, what was applied already.
-HARMLESS = {
-    "aabb_scale", "aabb", "scale", "offset", "scene_scale", "n_frames", "sharpness", "rotation", "time", "depth_path",
-    "depth_file_path", "normal_path", "colmap_im_id", "applied_transform", "applied_scale", "ply_file_path", "up",
-    "orientation_override", "auto_scale_poses_override", "train_filenames", "val_filenames", "test_filenames",
-    "render_aabb", "white_transparent", "black_transparent", "timestamp", "camera_label",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -37,6 +22,43 @@ class Transforms(NamedPhotographs):
 
     SRC is the file, or a folder with transforms.json or transforms_train.json.
     """
+
+    fields = Fields(
+        used={
+            "file_path img_path": "the photograph",
+            "transform_matrix": "the pose, camera-to-world",
+            "from_na": "NeuS2: the axes of the camera are OpenCV's",
+            "mask_path": "the mask",
+            "pl_pos pl_intensity": "position and intensity of the light",
+            "w h": "size of the photograph; without it, that of the file",
+            "fl_x fl_y cx cy": "focal lengths and principal point",
+            "camera_angle_x camera_angle_y x_fov y_fov": "fields of view [rad; degrees]",
+            "camera_intrinsics intrinsic_matrix": "focal lengths and principal point",
+            "camera_model is_fisheye": "the kind of lens",
+            "k1 k2 k3 k4 p1 p2": "distortion",
+        },
+        refused={
+            "distortion_params p3 p4 k5 k6 s1 s2 s3 s4": "such lenses; undistort the photographs first",
+            "ftheta_* lens_mode latlong equirectangular orthographic": "such lenses; undistort the photographs first",
+            "rolling_shutter transform_matrix_start transform_matrix_end": "a camera that moved during the exposure",
+            "from_mitsuba": "such axes of the camera",
+            "fix_premult": "colours that are divided by alpha",
+        },
+        told={"fisheye_crop_radius": "a mask of the lens", "is_hdr driver_parameters": "other light or colours"},
+        harmless={
+            "aabb_scale aabb render_aabb render_aabb_to_local scale offset scene_scale": "the scene's place in a box",
+            "applied_transform applied_scale": "what was done to the poses already",
+            "orientation_override auto_scale_poses_override": "what would be done to the poses",
+            "depth_path depth_file_path normal_path normal_file_path semantics_path": "other maps",
+            "enable_depth_loading integer_depth_scale depth_unit_scale_factor enable_ray_loading": "other maps",
+            "n_frames n_extra_learnable_dims envmap_resolution wants_importance_sampling": "settings of a method",
+            "train_filenames val_filenames test_filenames": "lists of photographs; all are used",
+            "rotation time timestamp sharpness blur_score": "of the animation that made the photograph, or its quality",
+            "colmap_im_id colmap_id camera_label ply_file_path": "names of other files and in them",
+            "up white_transparent black_transparent mask_color": "how to show the scene",
+            "frames": "holds the others",
+        },
+    )
 
     @property
     def folder(self) -> Path:
@@ -50,7 +72,7 @@ class Transforms(NamedPhotographs):
         frames = top.get("frames") if isinstance(top, dict) else None
         if not isinstance(frames, list) or not frames:
             raise InputError(f"{path}: frames: found none; must be a list of photographs")
-        unknown: list[str] = []
+        names: dict[str, None] = {}
         for number, own in enumerate(frames):
             where = f"frames[{number}]"
             if not isinstance(own, dict):
@@ -64,7 +86,7 @@ class Transforms(NamedPhotographs):
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix")
             if not fields.get("from_na"):  # NeuS2's sign of OpenCV's axes
                 pose = pose @ OPENGL
-            unknown += [key for key in fields if key not in USED | HARMLESS | {*REFUSED}]
+            names.update(dict.fromkeys(fields))
             camera = transforms_camera(fields, image, f"{path}: {where}")
             mask = own.get("mask_path")
             frame = Frame(image, camera, pose, said=name)
@@ -78,7 +100,7 @@ class Transforms(NamedPhotographs):
             if (position := own.get("pl_pos")) is not None:
                 frame.light = Light("point", matrix(position, (3,), f"{path}: {where}.pl_pos"), intensity)
             yield frame
-        self.note_unknown(path, unknown)
+        self.tell_unused(path, names)
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
@@ -95,10 +117,10 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
 
     size: Any = (number("w"), number("h")) if "w" in given and "h" in given else image_size(image)  # Lens truncates
     width, height = size
-    for name in REFUSED:
-        if any(np.ravel(given.get(name) or 0).tolist()):
-            raise InputError(f"{where}.{name}: is {str(given[name])[:60]}; such lenses are not supported; undistort "
-                             "the photographs first")  # fmt: skip
+    for name in given:
+        kind, why = Transforms.fields.kind_of(name)
+        if kind == "refused" and any(np.ravel(given[name] or 0).tolist()):
+            raise InputError(f"{where}.{name}: is {str(given[name])[:60]}, which is not supported: {why}")
     for name, fov in (("camera_angle_x", "x_fov"), ("camera_angle_y", "y_fov")):
         if fov in given:  # instant-ngp's, in degrees
             given = {name: math.radians(number(fov))} | given

@@ -1,11 +1,4 @@
-"""VisualSFM's models.
-
-Fields:
-
-- used: file name (a double quote stands for a space); focal length, quaternion w x y z, centre, radial distortion;
-  FixedK fx cx fy cy in line 1 (without it, the principal point is in the middle)
-- harmless: points, PLY files
-"""
+"""VisualSFM's models."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +9,7 @@ from scipy.interpolate import pade
 from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
+from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens, camera_to_world
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
@@ -34,6 +28,14 @@ class VisualSfm(Photogrammetry):
     SRC is the file. Of several models the one with the most photographs is taken. The file gives no sizes: the
     photographs must have their original size.
     """
+
+    fields = Fields(
+        used={
+            "name": "the photograph; a double quote stands for a space", "focal radial FixedK": "lens",
+            "qw qx qy qz cx cy cz": "pose: world to camera, and place",
+        },
+        harmless={"points PLY": "the surface starts from masks"},
+    )  # fmt: skip
 
     def posed(self) -> Iterator[Frame]:
         first, *lines = load_lines(self.src) or [""]

@@ -13,27 +13,15 @@ from PIL import ExifTags, Image
 
 from mi_ring.errors import InputError
 from mi_ring.foreign import reading
-from mi_ring.images import (
-    HEIF,
-    PLAIN,
-    RAW,
-    encoding_of,
-    exif_of,
-    linear_to_srgb,
-    mask_values,
-    open_image,
-    orientation_axes,
-    oriented,
-    read_image,
-    srgb_to_linear,
-)
+from mi_ring.image_headers import HEIF, KINDS, RAW, SUFFIXES, encoding_of, exif_of, open_image
+from mi_ring.images import linear_to_srgb, mask_values, orientation_axes, oriented, read_image, srgb_to_linear
 from mi_ring.importers.photogrammetry import exposures_of
 from mi_ring.importers.reading import image_size, read_as
 from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 from mi_ring.system.optional import need
 
-TRANSPARENT = (".png", ".tif", ".tiff", ".webp", ".avif")  #: suffixes of files that may have an alpha channel
+TRANSPARENT = (".png", ".tif", ".tiff", ".webp", ".avif", ".exr")  #: suffixes of files that may have an alpha channel
 FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of orientations, and EXIF's
 MIN_PHOTOGRAPHS = 8
 
@@ -57,15 +45,20 @@ class Picture:
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """Upright pixels (H, W, C) uint8 or uint16; see `encoding`. Raises InputError if the file cannot be read."""
+        """Upright pixels (H, W, C) uint8 or uint16; see `encoding`. Raises InputError if the file cannot be read.
+
+        Floats become uint16: 1 is full scale, and larger values are clipped.
+        """
         return oriented(self.stored(), self.orientation)
 
     def stored(self) -> np.ndarray:
         """The pixels as the file stores them, before they are turned upright."""
 
         pixels = read_as(self.path, "photograph", partial(read_image, heed=True))
-        if pixels.dtype not in (np.uint8, np.uint16):
-            raise InputError(f"{self.path}: has {pixels.dtype} pixels; photographs must have 8 or 16 bits")
+        if pixels.dtype == np.float32:
+            if not np.isfinite(pixels).all():
+                raise InputError(f"{self.path}: contains pixels that are NaN or infinite")
+            pixels = (pixels.clip(0, 1) * 65535 + 0.5).astype(np.uint16)
         return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
 
     @property
@@ -185,7 +178,8 @@ class Picture:
 
     def mask_file(self, folder: Path) -> Path | None:
         """The file in a folder that is named after this photograph; None if there is none."""
-        files = (folder / f"{self.path.name}.png", folder / f"{self.name}.png")
+        suffixes = [own for suffix in (".png", *SUFFIXES) for own in (suffix, suffix.upper())]
+        files = (folder / f"{name}{suffix}" for name in (self.path.name, self.name) for suffix in suffixes)
         return next((file for file in files if file.is_file()), None)
 
     def close(self) -> None:
@@ -225,7 +219,7 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         kind = path.suffix.lower()
-        if kind not in PLAIN + HEIF + RAW or path.name.startswith(".") or not path.is_file():
+        if kind not in SUFFIXES or path.name.startswith(".") or not path.is_file():
             continue
         command.require_utf8(str(path))
         if "$" in path.name:
@@ -233,7 +227,10 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
         if path.stem not in found or kind in RAW:  # a raw file is linear: prefer it to a JPEG of the same name
             found[path.stem] = path
     if len(found) < MIN_PHOTOGRAPHS:
-        raise InputError(f"{folder}: FOLDER: has {len(found)} photographs ({', '.join(PLAIN + HEIF)} or raw); at least "
+        kinds = Counter(path.suffix.lower() for path in folder.iterdir() if path.suffix and path.is_file())
+        others = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4) if kind not in SUFFIXES)
+        others = f", and files that are not read: {others}" if others else ""
+        raise InputError(f"{folder}: FOLDER: has {len(found)} photographs ({KINDS}){others}; at least "
                          f"{MIN_PHOTOGRAPHS} are needed, better 40, from all around")  # fmt: skip
     if "object" in found:
         raise InputError(f'{found["object"]}: FOLDER: "object" is a name that scenes need for the surface; rename it')

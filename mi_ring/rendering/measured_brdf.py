@@ -12,6 +12,7 @@ from mi_ring.foreign import load_npz
 CELLS = 90, 90, 180  #: of a table: numbers of cells of θh, θd, φd
 SCALES = np.array([1.0, 1.15, 1.66]) / 1500  #: of its red, green and blue plane
 FITTED_ANGLES = np.radians([80.0, 65.0])  #: θh and θd up to which the networks were fitted to enough data
+RGL = b"tensor_file"  #: how a file of the RGL database begins
 LAYERS = {"w1": (6, 21), "b1": (21,), "w2": (21, 21), "b2": (21,), "w3": (21, 3), "b3": (3,)}  #: of each network
 
 
@@ -26,6 +27,10 @@ class MerlTable:
 
     def __init__(self, path: Path):
         with path.open("rb") as file:
+            if file.read(len(RGL)) == RGL:
+                raise ValueError(f"{path}: is of the RGL database, not of MERL; give Mitsuba's plugin measured "
+                                 "with this filename")  # fmt: skip
+            file.seek(0)
             sizes = np.fromfile(file, "<i4", 3)
             if tuple(sizes) != CELLS:
                 raise ValueError(f"{path}: is no table of MERL: begins with {sizes.tolist()}, must be {list(CELLS)}")

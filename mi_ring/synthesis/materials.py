@@ -75,6 +75,9 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
             require_file(path, FORMS, field)
             material = {"material": name} if name else {}
             found = mi.load_dict({"type": "merl", "filename": str(path.resolve()), **material})
+        elif path.is_file():
+            what = "give measured filename=FILE.bsdf" if path.suffix.lower() == ".bsdf" else f"give {FORMS}"
+            raise InputError(f"{field}: {text}: is a file {path.suffix}; {what}")
         else:
             found = mi.load_dict(parse_plugin(text, field, coloured))
     except RuntimeError as error:

@@ -19,12 +19,16 @@ from helpers import foreign_captures, merl_tables, photogrammetry_files, structu
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import fitted_scene_xml
+from mi_ring.colour_profiles import primaries_profile
 from mi_ring.errors import InputError
 from mi_ring.fit import planned_before
 from mi_ring.fit_config import FitConfig
 from mi_ring.fitting.checkpoint import FORMAT, read_checkpoint
 from mi_ring.fitting.config import Config
+from mi_ring.foreign import reading
 from mi_ring.geometry.meshes import load_closed_mesh
+from mi_ring.image_fields import unused_fields
+from mi_ring.image_headers import bits_of, statement_of
 from mi_ring.importers import colmap, formats
 from mi_ring.importers.diligent_mv import DiligentMV
 from mi_ring.importers.frames import Source, frames_of, require_frames
@@ -34,7 +38,7 @@ from mi_ring.importers.metashape import Metashape
 from mi_ring.importers.middlebury import Middlebury
 from mi_ring.importers.neus import Neus
 from mi_ring.importers.photogrammetry import exif_values
-from mi_ring.importers.reading import has_alpha, image_size, pixels_of
+from mi_ring.importers.reading import has_alpha, image_size, orientation_of, pixels_of
 from mi_ring.importers.realitycapture import RealityCapture
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
@@ -252,22 +256,29 @@ def detected(folder: Path) -> Reader:
 
 
 def picture(name: str, write: Callable[[Path], object]) -> Callable[[Path], Reader]:
-    """A reader of an image file."""
+    """A reader of an image file, as photograph and as mask."""
 
     def of(folder: Path) -> Reader:
         path = folder / name
         write(path)
 
         def read() -> None:
-            for ask in (image_size, has_alpha, exif_values, pixels_of):
+            for ask in (image_size, has_alpha, exif_values, orientation_of, stated):
                 documented(lambda ask=ask: ask(path))
             one = Picture(path)
-            for ask in ("exif", "camera_orientation", "size", "pixels", "mask_pixels"):
+            for ask in ("exif", "camera_orientation", "size", "encoding", "pixels", "mask_pixels"):
                 documented(lambda ask=ask: getattr(one, ask))
 
         return Reader([path], read)
 
     return of
+
+
+def stated(path: Path) -> None:
+    """The pixels as the file says that they are encoded, and what `convert` says of them."""
+    pixels_of(path, heed=True)
+    with reading(path, "image"):
+        bits_of(path), statement_of(path), unused_fields(path)
 
 
 def documented(call: Callable[[], object]) -> None:
@@ -279,21 +290,14 @@ def documented(call: Callable[[], object]) -> None:
             raise
 
 
-def own_picture(name: str, write: Callable[[Path], object]) -> Callable[[Path], Reader]:
-    """A reader of photographs that `photos` alone takes."""
+def transparent() -> Image.Image:
+    """A picture with an alpha channel."""
+    return Image.fromarray(colours(2, channels=4))
 
-    def of(folder: Path) -> Reader:
-        path = folder / name
-        write(path)
 
-        def read() -> None:
-            one = Picture(path)
-            for ask in ("exif", "camera_orientation", "size", "pixels"):
-                documented(lambda ask=ask: getattr(one, ask))
-
-        return Reader([path], read)
-
-    return of
+def wide() -> bytes:
+    """A colour profile that is not sRGB's."""
+    return primaries_profile((0.3127, 0.3290), (0.680, 0.320, 0.265, 0.690, 0.150, 0.060))
 
 
 def write_heif(path: Path) -> None:
@@ -457,7 +461,19 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "tiff-compressed": picture("a.tif", lambda path: tifffile.imwrite(
         path, colours(2, np.uint16, 4), compression="zlib", predictor=True, photometric="rgb")),
     "exr": picture("a.exr", lambda path: mi.Bitmap(colours(3).astype(np.float32)).write(str(path))),
-    "heif": own_picture("a.heic", write_heif), "raw": own_picture("a.dng", write_dng),
+    "png-palette": picture("a.png", lambda path: transparent().quantize(method=Image.Quantize.FASTOCTREE).save(path)),
+    "png-profile": picture("a.png", lambda path: transparent().save(path, icc_profile=wide(), gamma=1 / 2.2)),
+    "jpeg-profile": picture("a.jpg", lambda path: Image.fromarray(colours(1)).save(path, icc_profile=wide())),
+    "jpeg-cmyk": picture("a.jpg", lambda path: Image.fromarray(colours(1)).convert("CMYK").save(path)),
+    "tiff-float": picture("a.tif", lambda path: tifffile.imwrite(
+        path, colours(2).astype(np.float16), photometric="rgb", iccprofile=wide())),
+    "tiff-planar": picture("a.tif", lambda path: tifffile.imwrite(
+        path, colours(2, np.uint16).transpose(2, 0, 1), photometric="rgb", planarconfig="separate", bigtiff=True)),
+    "tiff-palette": picture("a.tif", lambda path: Image.fromarray(colours(2)).quantize(9).save(path)),
+    "webp": picture("a.webp", lambda path: transparent().save(path, icc_profile=wide())),
+    "avif": picture("a.avif", lambda path: transparent().save(path)),
+    "bmp": picture("a.bmp", lambda path: Image.fromarray(colours(2)).save(path)),
+    "heif": picture("a.heic", write_heif), "raw": picture("a.dng", write_dng),
 }  # fmt: skip
 
 

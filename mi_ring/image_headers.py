@@ -1,0 +1,236 @@
+"""What the headers of image files say: format, size, depth, EXIF data, colours; before pixels are read."""
+
+import contextlib
+import io
+import itertools
+import math
+import os
+import struct
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from PIL import ExifTags, Image, UnidentifiedImageError
+
+from mi_ring.colour_profiles import (
+    ADOBE_RGB,
+    PRIMARIES,
+    WHITE,
+    Statement,
+    as_stated,
+    coded_statement,
+    primaries_profile,
+)
+from mi_ring.foreign import require_plausible_size
+from mi_ring.system.optional import need
+
+#: Suffixes of image files that are read, in lower case: common formats, formats whose package may be missing, others.
+PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp"), (".heic", ".heif")
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+SUFFIXES = (*PLAIN, *HEIF, *RAW, ".exr")
+TIFF = (".tif", ".tiff")
+KINDS = "JPEG, PNG, TIFF, OpenEXR, WebP, AVIF, HEIC, BMP or raw"  #: for messages
+FORMATS = "JPEG", "MPO", "PNG", "WEBP", "HEIF", "AVIF", "BMP", "TIFF"  #: formats in which Pillow may open a file
+PNG_DEPTH = 24  #: where a PNG file says the number of its bits
+COLOUR_BOX = b"colrnclx"  #: of HEIF and AVIF, followed by the codes of primaries and transfer curve
+BOXES = 2**16  #: bytes at the beginning of a HEIF or AVIF file that hold its boxes
+
+# Photographs of phones exceed Pillow's limit. `require_plausible_size` checks the size instead.
+Image.MAX_IMAGE_PIXELS = None
+
+
+class BoundedFile(io.BufferedReader):
+    """A file whose `read` allocates at most the bytes that are left, even if a damaged header requests more."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = max(0, os.fstat(self.fileno()).st_size - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+@contextlib.contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """Open an image file by Pillow, in a context manager.
+
+    Raises ValueError if it is no image or declares an implausible size, InputError if it is HEIF and pillow_heif is not
+    installed, and other errors if it is damaged.
+    """
+    if path.suffix.lower() in HEIF:
+        need("pillow_heif", f"{path}").register_heif_opener()
+    Image.init()
+    formats = [name for name in FORMATS if name in Image.OPEN]  # HEIF and AVIF may be missing
+    with BoundedFile(io.FileIO(path)) as file:
+        try:
+            image = Image.open(file, formats=formats)
+        except UnidentifiedImageError as error:  # its message does not name the file
+            raise ValueError(f"its content is none of {KINDS}; save it as one of them") from error
+        with image:
+            bands = 4 if image.has_transparency_data else len(image.getbands())  # palettes become RGBA
+            require_plausible_size(path, 2 * bands * math.prod(image.size))
+            yield image
+
+
+def exif_of(path: Path) -> Image.Exif:
+    """The EXIF data of an image file; empty if it has none. Raises the same errors as `open_image`."""
+    suffix, exif = path.suffix.lower(), Image.Exif()
+    if suffix in (*TIFF, *RAW):  # Pillow does not open all of their pixels
+        trouble = () if suffix in TIFF else (Exception,)  # of raw files that are no TIFFs
+        with contextlib.suppress(*trouble), BoundedFile(io.FileIO(path)) as file:
+            if file.peek(4)[:4] not in (b"II+\0", b"MM\0+"):  # BigTIFF, which Pillow cannot read
+                exif.load_from_fp(file)
+                exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
+    elif suffix != ".exr":
+        with open_image(path) as image:
+            exif = image.getexif()
+            exif.get_ifd(ExifTags.IFD.Exif)
+    return exif
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Read the width and height [px] that an image file declares. Raises the same errors as `open_image`."""
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        return exr_size(path)[:2]
+    if suffix in TIFF:  # Pillow would rotate it by its orientation; `read_image` does not
+        with tifffile.TiffFile(path) as file:
+            return file.pages.first.imagewidth, file.pages.first.imagelength
+    if suffix in RAW:
+        with need("rawpy", f"{path}").imread(str(path)) as raw:
+            return raw.sizes.iwidth, raw.sizes.iheight
+    with open_image(path) as image:
+        return image.size
+
+
+def statement_of(path: Path) -> Statement:
+    """What an image file says about its colours. Raises the same errors as `open_image`.
+
+    The first of these counts: codes of PNG (cICP), a profile, codes of HEIF and AVIF, chunks of PNG, Adobe RGB by EXIF.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        if len(found := dict(exr_attributes(path)).get(b"chromaticities", b"")) == 32:
+            *primaries, x, y = struct.unpack("<8f", found)
+            return Statement(primaries_profile((x, y), tuple(primaries)))
+    elif suffix in TIFF:
+        with tifffile.TiffFile(path) as file:
+            return Statement(file.pages.first.iccprofile)
+    elif suffix not in RAW:
+        with open_image(path) as image:
+            if image.format == "PNG" and len(codes := dict(png_chunks(path)).get(b"cICP", b"")) == 4:
+                return coded_statement(codes[0], codes[1])
+            if profile := image.info.get("icc_profile"):
+                return Statement(profile)
+            if image.format in ("HEIF", "AVIF"):
+                with path.open("rb") as file:
+                    codes = file.read(BOXES).partition(COLOUR_BOX)[2][:4]
+                return coded_statement(*struct.unpack(">HH", codes)) if len(codes) == 4 else Statement()
+            if image.format == "PNG":
+                return png_statement(image.info, bits_of(path))
+            exif = image.getexif()
+            space = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.ColorSpace)
+            index = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex)
+            if space == 2 or (space != 1 and index == "R03"):
+                return Statement(ADOBE_RGB)
+    return Statement()
+
+
+def png_statement(info: dict, bits: int) -> Statement:
+    """What the chunks sRGB, gAMA and cHRM of a PNG file say. `info`: as Pillow reads them."""
+    if "srgb" in info:
+        return Statement(None, 2.2)
+    gamma, places = info.get("gamma"), info.get("chromaticity")
+    exponent = 1 / gamma if gamma else None
+    if not places or np.allclose(places, (*WHITE, *PRIMARIES), atol=2e-3):
+        return Statement(None, exponent)
+    curve = exponent or (2.2 if bits == 8 else 1.0)
+    return Statement(primaries_profile(places[:2], places[2:], 2.2 if abs(curve - 2.2) < 0.05 else curve))
+
+
+def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Name and content of the chunks of a PNG file before its pixels; longer ones are cut off after 64 bytes."""
+    with path.open("rb") as file:
+        file.seek(8)
+        while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
+            size = int.from_bytes(head[:4], "big")
+            yield head[4:], file.read(min(size, 64))
+            file.seek(max(0, size - 64) + 4, os.SEEK_CUR)
+
+
+def bits_of(path: Path) -> int:
+    """Bits of a channel that an image file stores: 8, 16, or 32 for floats. Raises the same errors as `open_image`."""
+    suffix = path.suffix.lower()
+    if suffix in TIFF:
+        with tifffile.TiffFile(path) as file:
+            kind = file.pages.first.dtype
+            return 32 if kind is None or kind.kind == "f" else 8 if kind.itemsize == 1 else 16
+    if suffix in (".exr", *RAW):
+        return 32 if suffix == ".exr" else 16
+    with path.open("rb") as file:
+        head = file.read(PNG_DEPTH + 1)
+    return 16 if head.startswith(b"\x89PNG") and head[PNG_DEPTH:] == b"\x10" else 8
+
+
+def encodings(paths: Sequence[Path]) -> list[str]:
+    """How the pixels of image files are encoded, as a clause for each kind."""
+    bits = Counter(bits_of(path) for path in paths)
+    said = sum(statement_of(path) != Statement() for path in paths)
+    found = [f"{bits[8]} files of 8 bits are sRGB"] if bits[8] else []
+    found += [f"{bits[16]} files of 16 bits are linear"] if bits[16] else []
+    found += [f"{bits[32]} files of floats are linear"] if bits[32] else []
+    return found + ([f"except as {said} of the files say themselves"] if said else [])
+
+
+def encoding_of(path: Path) -> str:
+    """The encoding of the pixels that `read_image` gives with `heed`: srgb or linear."""
+    said = statement_of(path)
+    sample = np.zeros((1, 1, 3), np.uint8)
+    return "srgb" if bits_of(path) == 8 and as_stated(sample, said).dtype == np.uint8 else "linear"
+
+
+def exr_attributes(path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Name and value of the attributes of an OpenEXR file; values are cut off after 64 KiB.
+
+    The header is a list of attributes ("OpenEXR File Layout"): name and type, which end in a zero byte, size, value.
+    Raises ValueError if it is no OpenEXR file, or one of several parts.
+    """
+    with path.open("rb") as file:
+
+        def text() -> bytes:
+            letters = iter(lambda: file.read(1) or b"\0", b"\0")
+            return b"".join(itertools.islice(letters, 256))  # the longest that the format allows
+
+        if (head := file.read(8))[:4] != b"\x76\x2f\x31\x01":
+            raise ValueError("no OpenEXR file")
+        if head[5] & 0x10:
+            raise ValueError("has several parts; save the one of the photograph alone")
+        while name := text():
+            text()
+            (size,) = struct.unpack("<I", file.read(4))
+            yield name, file.read(min(size, 2**16))
+            file.seek(max(0, size - 2**16), os.SEEK_CUR)
+
+
+def exr_channels(value: bytes) -> list[str]:
+    """The names of the channels in the attribute of that name: each is followed by a zero byte and 16 more bytes."""
+    names, place = [], 0
+    while value[place]:
+        end = value.index(b"\0", place)
+        names.append(value[place:end].decode("utf-8", "replace"))
+        place = end + 17
+    return names
+
+
+def exr_size(path: Path) -> tuple[int, int, int]:
+    """Width [px], height [px] and number of channels that the header of an OpenEXR file declares.
+
+    Raises ValueError if it has no pixels, or not those of the whole picture.
+    """
+    found = dict(exr_attributes(path))
+    left, top, right, bottom = data = struct.unpack("<4i", found[b"dataWindow"])
+    channels = len(exr_channels(found[b"channels"]))
+    if min(right - left, bottom - top, channels - 1) < 0:
+        raise ValueError("declares no pixels")
+    if data != (whole := struct.unpack("<4i", found.get(b"displayWindow", found[b"dataWindow"]))):
+        raise ValueError(f"its data window {data} is not its display window {whole}; save the whole picture")
+    return right - left + 1, bottom - top + 1, channels
