@@ -70,8 +70,8 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
         fit.main([str(broken_capture[0]), "--out", str(tmp_path), "--resume"])
     with pytest.raises(InputError, match="gone.xml: no such file"):
         fit.main([str(tmp_path / "gone.xml"), "--out", str(tmp_path), "--resume"])
-    with pytest.raises(InputError, match=f"--iterations: was {ITERATIONS} before, is 80 now; --batch: was 4 before, is 8 "
-                       "now, the default; give the same"):  # fmt: skip
+    changed = f"--iterations: was {ITERATIONS} before, is 80 now; --batch: was 4 before, is 8 now, the default; give"
+    with pytest.raises(InputError, match=f"{changed} the same"):
         fit.main(
             [str(small_capture), "--out", str(finished), "--resume", "--iterations", "80", *SPHERE, "--batch", "8"]
         )
