@@ -49,7 +49,7 @@ def normalized(vectors: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=4)
-def samplings(kind: type, points: bytes, faces: bytes) -> tuple[dict, dict]:
+def samplings(kind: str, points: bytes, faces: bytes) -> tuple[dict, dict]:
     """Meshes and candidates by level, shared by all domains of one surface: to remesh a hull takes seconds."""
     return {}, {}
 
@@ -65,7 +65,7 @@ class Domain:
         self.faces = np.asarray(faces, np.int64)
         self.levels: dict[int, tuple[Tensor, np.ndarray]]
         self.candidates: dict[int, Tensor]
-        self.levels, self.candidates = samplings(type(self), self.points.tobytes(), self.faces.tobytes())
+        self.levels, self.candidates = samplings(type(self).__name__, self.points.tobytes(), self.faces.tobytes())
 
     def sample(self, level: int, random: torch.Generator | None = None) -> tuple[Tensor, np.ndarray]:
         """Sample the surface: vertices (V, 3) and about 20 · 4^level faces (F, 3), as in an icosphere of this level.
