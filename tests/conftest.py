@@ -169,12 +169,12 @@ def small_capture(tmp_path_factory):
 @pytest.fixture(scope="session")
 def finished(small_capture, tmp_path_factory):
     """The results folder of a quick fit, for tests that only read it."""
-    from helpers.quick_fits import SPHERE
+    from helpers.quick_fits import ITERATIONS, SPHERE
 
     from mi_ring import fit
 
     folder = tmp_path_factory.mktemp("fit") / "small"
-    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "90", *SPHERE]) == 0
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", str(ITERATIONS), *SPHERE]) == 0
     return folder
 
 

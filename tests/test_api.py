@@ -257,12 +257,12 @@ def test_jacobians_of_the_networks():
 
 
 def test_a_fit_goes_on_from_its_state(capture):
-    whole = mi_ring.Fit(capture, config(domain="hull"))
+    whole = mi_ring.Fit(capture, config())
     first = iter(whole)
     next(first), next(first)
     state = whole.state()
     rest = [it.loss for it in first]
-    again = mi_ring.Fit(capture, config(domain="hull"), state=state)
+    again = mi_ring.Fit(capture, config(), state=state)
     assert again.iteration == 2 and [it.loss for it in again] == pytest.approx(rest, rel=1e-4)
 
 

@@ -94,15 +94,17 @@ SMALL = ["--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "
 
 
 def test_a_fit_of_so_many_minutes_goes_on_as_one(small_capture, tmp_path, monkeypatch, capsys):
-    """At 0.5 s an iteration 20 of 60 s are for pictures and results, and 80 iterations are left."""
-    monkeypatch.setattr(command, "measure", lambda fit, stages: {(2, 28): 0.5})
+    """At 2.5 s an iteration 20 of 60 s are for pictures and results, and 16 iterations are left."""
+    monkeypatch.setattr(command, "measure", lambda fit, stages: {(2, 28): 2.5})
+    monkeypatch.setattr(budget, "FEWEST", 8)
+    monkeypatch.setattr(budget, "AROUND", 8)
     monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: 0.0, perf_counter=lambda: 0.0))
     call = [str(small_capture), "--out", str(tmp_path / "run"), *SMALL, "--minutes", "1"]
     with pytest.raises(InputError, match="is 0.5, too few for a fit of this capture on this machine; give 0.8 or more"):
-        command.main([*call[:-1], "0.5"])  # 40 iterations, and what takes as long: 40 s, and a fifth more
+        command.main([*call[:-1], "0.5"])  # 8 iterations, and what takes as long: 40 s, and a fifth more
     assert command.main(call) == 0
     options = json.loads((tmp_path / "run/config.json").read_text())
-    assert options["iterations"] == 80 and options["minutes"] == 1
+    assert options["iterations"] == 16 and options["minutes"] == 1
     assert read_log(tmp_path / "run")[-1]["iteration"] == options["iterations"]
     assert f"--preset {options['preset']} --iterations {options['iterations']}" in capsys.readouterr().out
     assert command.main([*call, "--resume"]) == 0

@@ -556,7 +556,8 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
 def test_a_fit_finds_a_flash_that_is_not_where_it_is_said_to_be(small_capture, tmp_path):
     wrong = np.array([-6.0, -16.0, 4.0])  # beyond a tenth of the distance
     scene = edited(small_capture, tmp_path / "wrong", lambda element: move_light(element, wrong))
-    config = Config(iterations=150, levels=(3,), widths=(56,), shares=(1,), refine=("light",), velocity_decay=0.3)
+    config = Config(iterations=80, levels=(3,), widths=(56,), shares=(1,), refine=("light",), velocity_decay=0.3,
+                    batch=4, subdivisions=3)  # fmt: skip
     running = Fit(mi_ring.load_capture(scene), config)
     for _ in running:
         pass
@@ -618,7 +619,7 @@ def test_photographs_kept_out_are_not_fitted_and_judge_what_was_refined(small_ca
 
 def test_a_fit_says_what_photographs_that_are_kept_out_say(small_capture, tmp_path):
     """To its end, with what is shared, what is of each photograph, and what is solved for; and without any of it."""
-    tiny = ["--iterations", "10", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2",
+    tiny = ["--iterations", "4", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2",
             "--holdout", "5", "--domain", "sphere"]  # fmt: skip
     for refine in (["light", "power", "scale", "ambient"], ["none"]):
         out = tmp_path / refine[0]

@@ -8,13 +8,14 @@ import pytest
 import torch
 import trimesh
 from conftest import CENTER
-from helpers.quick_fits import QUICK, SPHERE, TABLE
+from helpers.quick_fits import ITERATIONS, QUICK, SPHERE, TABLE
 
 from mi_ring import fit
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
 from mi_ring.fitting import session
 from mi_ring.fitting.fit import Fit
+from mi_ring.geometry import domain
 from mi_ring.output import results
 from mi_ring.system import files, machine
 
@@ -26,6 +27,7 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(broken_captur
         edit("</scene>", TABLE)
     arguments = [str(small_capture), "--iterations", "8", "--deterministic", "--seed", "4", *start]
     assert fit.main([*arguments, "--out", str(tmp_path / "a")]) == 0
+    domain.samplings.cache_clear()  # as in a process of its own
 
     interrupted = fit.parse_options([*arguments, "--out", str(tmp_path / "b")])
     with machine.threads_of(1):
@@ -68,8 +70,8 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
         fit.main([str(broken_capture[0]), "--out", str(tmp_path), "--resume"])
     with pytest.raises(InputError, match="gone.xml: no such file"):
         fit.main([str(tmp_path / "gone.xml"), "--out", str(tmp_path), "--resume"])
-    with pytest.raises(InputError, match="--iterations: was 90 before, is 80 now; --batch: was 4 before, is 8 now, the "
-                       "default; give the same"):  # fmt: skip
+    changed = f"--iterations: was {ITERATIONS} before, is 80 now; --batch: was 4 before, is 8 now, the default; give"
+    with pytest.raises(InputError, match=f"{changed} the same"):
         fit.main(
             [str(small_capture), "--out", str(finished), "--resume", "--iterations", "80", *SPHERE, "--batch", "8"]
         )
@@ -92,7 +94,7 @@ def test_a_checkpoint_that_no_fit_has_written_is_refused(part, change, finished,
     state = torch.load(finished / "checkpoint.pt", weights_only=False)
     change = {part: state["fit"][part] | change} if part else change
     files.write_state(state | {"fit": state["fit"] | change}, tmp_path / "checkpoint.pt")
-    options = ["--out", str(tmp_path), "--resume", "--iterations", "90", *SPHERE]
+    options = ["--out", str(tmp_path), "--resume", "--iterations", str(ITERATIONS), *SPHERE]
     with pytest.raises(InputError, match=r"checkpoint\.pt: holds no fit that could go on"):
         fit.main([str(small_capture), *options])
 

@@ -19,7 +19,8 @@ from mi_ring.nets.shape_net import ShapeNet
 from mi_ring.rendering import bridge
 from mi_ring.system import machine
 
-TINY = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--batch", "2", "--subdivisions", "2"]
+TINY = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--batch", "2", "--subdivisions", "2",
+        "--domain", "sphere"]  # fmt: skip
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU and a torch built with CUDA")
 
 

@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from mi_ring.errors import InputError
-from mi_ring.geometry.domain import CANDIDATES, Domain, Sphere, closed_domain
+from mi_ring.geometry.domain import CANDIDATES, Domain, Sphere, closed_domain, samplings
 from mi_ring.geometry.meshes import load_closed_mesh
 
 MAJOR, MINOR = 1.0, 0.35
@@ -62,6 +62,16 @@ def test_beyond_the_finest_level_triangles_are_cut_in_four(torus, monkeypatch):
         assert len(torus.sample(4)[1]) == 4 * len(torus.sample(3)[1])
     finally:
         torus.levels.pop(4)
+
+
+def test_domains_of_one_surface_share_its_samplings_which_are_the_same_when_they_are_made_anew(torus):
+    again, other = Domain(torus.points, torus.faces), Domain(1.001 * torus.points, torus.faces)
+    points, faces = again.sample(3)
+    assert points is torus.sample(3)[0]
+    assert not torch.equal(other.sample(3)[0], points)
+    samplings.cache_clear()
+    anew = Domain(torus.points, torus.faces).sample(3)
+    assert anew[0] is not points and torch.equal(anew[0], points) and np.array_equal(anew[1], faces)
 
 
 def test_a_level_too_coarse_for_the_handles_keeps_them():

@@ -253,7 +253,7 @@ def test_photographs_in_a_lit_room_are_compared_inside_their_masks(broken_captur
         mi.Bitmap(picture).write(str(path.parent / f"images/{k:03}.png"))
     scene = loading.load_capture(path)
     assert scene.lit_room
-    ring = FittedObject(CENTER, 25.0, scale=0.5)
+    ring = FittedObject(CENTER, 25.0, scale=0.5, subdivisions=3)
     numbers, views = image_errors.compare_photographs(scene, ring, 4)
     surface = image_errors.Surface(scene.scene, scene.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
@@ -276,7 +276,7 @@ def test_photographs_in_a_lit_room_are_compared_inside_their_masks(broken_captur
 def sphere_run(small_capture, tmp_path_factory):
     """The results folder of a fit that has not begun."""
     folder = tmp_path_factory.mktemp("run")
-    ring = FittedObject(CENTER, 25.0, scale=0.5)
+    ring = FittedObject(CENTER, 25.0, scale=0.5, subdivisions=3)
     torch.save(ring_state(ring), folder / "ring.pt")
     ply.write_mesh(ring, 3, folder / "mesh.ply")
     scene = scenefile.fitted_scene_xml(small_capture, folder, 3, '<bsdf type="cooktorrance"/>')

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from helpers.quick_fits import FILES, SPHERE, TABLE, distance
+from helpers.quick_fits import FILES, ITERATIONS, SPHERE, TABLE, distance
 from PIL import Image
 
 from mi_ring import __main__, fit, render
@@ -32,14 +32,14 @@ def test_fit_writes_all_results_and_no_other_files(finished):
 def test_logged_loss_is_the_weighted_sum_of_its_terms(finished):
     log = [json.loads(line) for line in (finished / "log.jsonl").read_text().splitlines()]
     for entry in log:
-        done = (entry["iteration"] - 1) / 90
+        done = (entry["iteration"] - 1) / ITERATIONS
         velocity = entry["weights"]["velocity"]  # as planned, or stronger
         assert 0.01 * 0.03**done <= velocity * (1 + 1e-9) <= 0.01 * (1 + 2e-9)
         weights = {"rgb": 1.0, "mask": 5.0, "velocity": velocity, "calibration": 1e-3}
         assert entry["weights"] == pytest.approx(weights)
         assert entry["loss"] == pytest.approx(sum(w * entry[term] for term, w in weights.items()), rel=1e-4)
         assert entry["learning_rate"] == pytest.approx(3e-3 * 0.1**done)
-    assert log[-1]["iteration"] == 90
+    assert log[-1]["iteration"] == ITERATIONS
 
 
 def test_steps_of_the_flow_are_part_of_the_result(finished):
@@ -69,11 +69,11 @@ def test_mesh_is_closed_outward_and_carries_the_material(finished):
 
 def test_log_and_configuration_tell_what_happened(finished):
     log = results.read_log(finished)
-    assert [entry["iteration"] for entry in log] == list(range(5, 95, 5))
+    assert [entry["iteration"] for entry in log] == list(range(5, ITERATIONS + 5, 5))
     assert {"seconds", "loss", "rgb", "mask", "velocity", "learning_rate", "vertices"} <= set(log[0])
     assert log[0]["vertices"] == 162 and log[-1]["vertices"] == 642
     assert log[-1]["rgb"] < 0.5 * log[0]["rgb"]
-    assert json.loads((finished / "config.json").read_text())["iterations"] == 90
+    assert json.loads((finished / "config.json").read_text())["iterations"] == ITERATIONS
 
 
 def test_scene_opens_in_mitsuba_and_path_shows_the_object(finished, small_capture):

@@ -14,7 +14,7 @@ from mi_ring.fitting import fit as fitting
 from mi_ring.fitting import mask_refinement
 
 WITHOUT = [1, 4, 5, 10]  #: photographs whose masks are taken away
-BRIEF = {"iterations": 60, "levels": (3,), "widths": (56,), "shares": (1,), "subdivisions": 3}
+BRIEF = {"iterations": 40, "levels": (3,), "widths": (56,), "shares": (1,), "subdivisions": 3}
 
 
 def ellipse(x, y, rows=50, columns=70):
@@ -62,7 +62,7 @@ def test_masks_that_are_missing_are_found_about_the_surface_and_written(without_
     fit = Fit(capture, Config(**BRIEF, refine=("masks",)))
     for it in fit:
         masked = sum(mask is not None for mask in fit.capture.masks)
-        assert masked == (12 if it.number > 30 else 12 - len(WITHOUT))
+        assert masked == (12 if it.number > 20 else 12 - len(WITHOUT))
     assert [k for k, mask in enumerate(capture.masks) if mask is None] == WITHOUT  # the capture stays as it was
     for k in range(12):
         assert overlap(fit.capture.masks[k] > 127, true[k]) > 0.93, k
@@ -112,7 +112,7 @@ def test_masks_that_do_not_go_with_the_surface_are_not_taken(without_some_masks,
     monkeypatch.setattr(
         mask_refinement, "grabcut", lambda picture, coverage, background, band: coverage * (np.arange(56) > 27)
     )
-    fit.course.iteration = 30
+    fit.course.iteration = 20
     fit.step()
     assert not fit.course.masks
     for before, after in zip(capture.masks, fit.capture.masks):

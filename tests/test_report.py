@@ -68,8 +68,8 @@ def glb(positions, normals, uv, faces, image, scale=1.0, seen=None):
 @pytest.fixture(scope="module")
 def fitted(small_capture):
     """The result of a quick fit."""
-    fitted = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), "--iterations", "50", *QUICK]))
-    assert len(list(fitted)) == 50
+    fitted = Fit(load_capture(small_capture), fit.parse_options([str(small_capture), "--iterations", "30", *QUICK]))
+    assert len(list(fitted)) == 30
     return fitted.result()
 
 

@@ -56,7 +56,7 @@ def test_captures_of_every_kind_are_fitted(change, broken_capture, tmp_path):
     path, _ = broken_capture
     change(path)
     quick = SPHERE if change in (two_sizes, distant_lights) else QUICK  # which take longer, from a hull or a mesh
-    assert fit.main([str(path), "--out", str(tmp_path / "run"), "--iterations", "12", *quick]) == 0
+    assert fit.main([str(path), "--out", str(tmp_path / "run"), "--iterations", "6", *quick]) == 0
     log = results.read_log(tmp_path / "run")
     assert all(np.isfinite(entry["loss"]) for entry in log)
     mesh = trimesh.load(tmp_path / "run" / "mesh.ply", process=False)
@@ -65,7 +65,7 @@ def test_captures_of_every_kind_are_fitted(change, broken_capture, tmp_path):
 
 def test_start_from_the_visual_hull(small_capture, tmp_path):
     run = tmp_path / "run"
-    assert fit.main([str(small_capture), "--out", str(run), "--iterations", "12", "--domain", "hull", *QUICK]) == 0
+    assert fit.main([str(small_capture), "--out", str(run), "--iterations", "6", "--domain", "hull", *QUICK]) == 0
     assert distance(run / "mesh.ply") < 0.04  # hardly a fit: it is the start that is near
     mesh = trimesh.load(run / "mesh.ply", process=False)
     assert mesh.is_watertight and mesh.euler_number == 2

@@ -1,5 +1,7 @@
 """Domains: the surfaces from which Shape-Net's flow starts and on which BRDF-Net is defined."""
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 import trimesh
@@ -46,6 +48,12 @@ def normalized(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+@lru_cache(maxsize=4)
+def samplings(kind: str, points: bytes, faces: bytes) -> tuple[dict, dict]:
+    """Meshes and candidates by level, shared by all domains of one surface: to remesh a hull takes seconds."""
+    return {}, {}
+
+
 class Domain:
     """A closed surface in the normalised frame, given as a mesh with vertices (V, 3) and faces (F, 3).
 
@@ -55,8 +63,9 @@ class Domain:
     def __init__(self, points: ArrayLike, faces: ArrayLike) -> None:
         self.points = np.asarray(points, np.float32)
         self.faces = np.asarray(faces, np.int64)
-        self.levels: dict[int, tuple[Tensor, np.ndarray]] = {}
-        self.candidates: dict[int, Tensor] = {}
+        self.levels: dict[int, tuple[Tensor, np.ndarray]]
+        self.candidates: dict[int, Tensor]
+        self.levels, self.candidates = samplings(type(self).__name__, self.points.tobytes(), self.faces.tobytes())
 
     def sample(self, level: int, random: torch.Generator | None = None) -> tuple[Tensor, np.ndarray]:
         """Sample the surface: vertices (V, 3) and about 20 · 4^level faces (F, 3), as in an icosphere of this level.

@@ -11,6 +11,7 @@ from mi_ring.fitting.iteration import Iteration
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
 SPHERE = [*QUICK, "--domain", "sphere"]  # whose sizes are known
+ITERATIONS = 40  #: of the fit that the fixture `finished` makes
 
 
 def distance(mesh_file):
