@@ -223,7 +223,7 @@ def make(config: PhotosConfig, scene: Path) -> None:
         root.append(room_element("camera" if config.turntable else "world", harmonics))
     try:
         cuts = crop_windows([posed.mask for posed in taken], [posed.lens.size for posed in taken])
-        written = in_threads(partial(write_posed_picture, writer), taken, cuts)
+        written = in_threads(partial(write_posed_picture, writer), taken, cuts, most=folder.DECODED)
         root.extend(progress(written, "writing", len(taken)))
         if plane and flash:
             root.extend(write_table(writer, taken, plane, found.center, flash))

@@ -14,7 +14,7 @@ from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window, undistort
 from mi_ring.importers.writer import Writer
 from mi_ring.photogrammetry.flash_light import FlashCalibration
-from mi_ring.photogrammetry.folder import Picture
+from mi_ring.photogrammetry.folder import DECODED, Picture
 from mi_ring.photogrammetry.reduced_photographs import ReducedView, reduce_photograph
 from mi_ring.photogrammetry.table_plane import Plane, TexelGrid, estimate_albedo
 from mi_ring.scene.lights import Light
@@ -104,7 +104,7 @@ def write_table(
         mask = cv2.resize((posed.mask > 0).astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST)
         return view, dilate_by_share(mask, MARGIN), light
 
-    views, hidden, lights = zip(*in_threads(observe, pictures))
+    views, hidden, lights = zip(*in_threads(observe, pictures, most=DECODED))
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     texels = TexelGrid(plane, center, TABLE_HALF_SIZE * distance, TABLE_TEXELS)
     albedo = estimate_albedo(views, lights, hidden, texels, flash)

@@ -24,6 +24,7 @@ from mi_ring.system.optional import need
 TRANSPARENT = (".png", ".tif", ".tiff", ".webp", ".avif", ".exr")  #: suffixes of files that may have an alpha channel
 FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  #: LibRaw's numbers of orientations, and EXIF's
 MIN_PHOTOGRAPHS = 8
+DECODED = 2  #: photographs that are decoded at a time: each may take 500 MB
 
 
 @dataclass(frozen=True)
@@ -149,11 +150,10 @@ class Picture:
             return 1.0
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
-    def linear(self) -> np.ndarray:
-        """The photograph as linear radiance, (H, W, 3) float32, 1.0 = full scale."""
-        rgb = self.pixels[:, :, :3]
-        value = np.arange(np.iinfo(rgb.dtype).max + 1, dtype=np.float32) / np.iinfo(rgb.dtype).max
-        return (value if self.encoding == "linear" else srgb_to_linear(value))[rgb]
+    def to_linear(self, pixels: np.ndarray) -> np.ndarray:
+        """Linear radiance (H, W, 3) float32 of a part of `pixels` without alpha; 1.0 = full scale."""
+        value = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=np.float32) / np.iinfo(pixels.dtype).max
+        return (value if self.encoding == "linear" else srgb_to_linear(value))[pixels]
 
     def mask(self, source: str | Path) -> np.ndarray | None:
         """The user's mask (H, W) uint8, 255 on the object; None if this photograph has none.

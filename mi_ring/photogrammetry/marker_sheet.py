@@ -1,6 +1,6 @@
 """The printed sheet of ChArUco markers: its page, its corners and white paper in photographs, poses and scale."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Literal, NamedTuple
 
 import cv2
@@ -211,8 +211,17 @@ class PaperSamples(NamedTuple):
     in_margin: np.ndarray  #: (n,) bool: in the page's margin; if that was cut off, the sample shows the table
 
 
-def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
-    """Sample white squares and the margin in a photograph (H, W, 3): median colours, none above `CLIPPED`."""
+def sample_paper(
+    photograph: np.ndarray, detection: SheetDetection, linear: Callable[[np.ndarray], np.ndarray] = np.asarray
+) -> PaperSamples:
+    """Sample white squares and the margin in a photograph (H, W, 3): median colours, none above `CLIPPED`.
+
+    `linear` makes a part of the photograph linear, float32. All of it would take too much memory.
+    """
+
+    def sample(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
+        return sample_colours(photograph, linear, points, plane)
+
     pixels = dict(zip(detection.ids.tolist(), detection.pixels))
     points = dict(zip(detection.ids.tolist(), detection.points))
     unit = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
@@ -229,22 +238,29 @@ def sample_paper(linear: np.ndarray, detection: SheetDetection) -> PaperSamples:
         plane = cv2.getPerspectiveTransform(unit, four)
         if (row + column) % 2:
             # In oblique views two opposite rims are so narrow that they mix with black: take the brighter pair.
-            rims = np.median(sample_colours(linear, RIMS, plane).reshape(2, 2, -1, 3), 2).mean(0)
+            rims = np.median(sample(RIMS, plane).reshape(2, 2, -1, 3), 2).mean(0)
             samples.append((first + [0.5, 0.5] @ sides, rims[rims.sum(1).argmax()], False))
         for place, outermost in zip(MARGINS, (column == 0, column == COLUMNS - 3, row == 0)):
             if outermost:
-                colour = np.median(sample_colours(linear, place + PATCH, plane), 0)  # NaN if partly outside
+                colour = np.median(sample(place + PATCH, plane), 0)  # NaN if partly outside
                 samples.append((first + place @ sides, colour, True))
     samples = [sample for sample in samples if sample[1].max() < CLIPPED]
     where, colours, in_margin = zip(*samples) if samples else ((), (), ())
     return PaperSamples(np.reshape(where, (-1, 3)), np.reshape(colours, (-1, 3)), np.array(in_margin, bool))
 
 
-def sample_colours(linear: np.ndarray, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Sample a photograph (H, W, 3) at points (n, 2) of a plane: colours (n, 3), NaN outside the photograph.
+def sample_colours(
+    photograph: np.ndarray, linear: Callable[[np.ndarray], np.ndarray], points: np.ndarray, plane: np.ndarray
+) -> np.ndarray:
+    """Sample a photograph (H, W, 3) at points (n, 2) of a plane: linear colours (n, 3), NaN outside the photograph.
 
-    `plane` (3, 3): homography that maps points to pixels.
+    `plane` (3, 3): homography that maps points to pixels. `linear`: see `sample_paper`.
     """
-    at = (cv2.perspectiveTransform(points[None], plane) - 0.5).astype(np.float32)
-    x, y = np.ascontiguousarray(np.moveaxis(at, -1, 0))  # (1, n): versions of OpenCV differ on one-dimensional maps
-    return cv2.remap(linear, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[np.nan] * 4)[0]
+    at = cv2.perspectiveTransform(points[None], plane) - 0.5
+    height, width = photograph.shape[:2]
+    left, top = (np.floor(at.min((0, 1))).clip(0, [width - 1, height - 1])).astype(int)
+    right, bottom = (np.ceil(at.max((0, 1))).clip(0, [width - 1, height - 1])).astype(int) + 1
+    part = linear(photograph[top:bottom, left:right])
+    # (1, n): versions of OpenCV differ on one-dimensional maps
+    x, y = np.ascontiguousarray(np.moveaxis(at - [left, top], -1, 0), np.float32)
+    return cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[np.nan] * 4)[0]

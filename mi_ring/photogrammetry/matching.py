@@ -13,7 +13,7 @@ from PIL import Image
 
 from mi_ring.errors import InputError
 from mi_ring.nets.chunks import in_parallel
-from mi_ring.photogrammetry.folder import Picture, focal_35mm
+from mi_ring.photogrammetry.folder import DECODED, Picture, focal_35mm
 from mi_ring.system.machine import cores, in_threads, interruptible
 from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
@@ -22,7 +22,6 @@ pycolmap = LazyPackage("pycolmap", "structure from motion")
 #: Longer side of the images in which features are searched [px], maximum number of features, and their least contrast.
 #: A smooth object has few strong features: weak ones are kept, and geometric verification removes the wrong ones.
 LONGEST, FEATURES, PEAK = 1600, 4096, 0.003
-DECODED = 2  #: photographs that are decoded at a time
 LENGTH = 512.0  #: of a descriptor
 #: Largest angle between the descriptors of a match [radians], also as a share of the angle to the second nearest one:
 #: RATIO to find the geometry of two photographs, LOOSE for matches that agree with it.

@@ -10,7 +10,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import srgb_to_linear
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window, source_positions
-from mi_ring.photogrammetry.folder import Picture
+from mi_ring.photogrammetry.folder import DECODED, Picture
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import Progress
 
@@ -74,7 +74,7 @@ def read_windows(
         picture.close()
         return views
 
-    return list(progress(in_threads(read, pictures, windows), "reading", len(pictures)))
+    return list(progress(in_threads(read, pictures, windows, most=DECODED), "reading", len(pictures)))
 
 
 def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from mi_ring.importers.frames import adapt, frames_of, require_cameras
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, reduction
 from mi_ring.photogrammetry.flash_light import FlashCalibration, ObjectSphere, calibrate_flash
-from mi_ring.photogrammetry.folder import Picture, relative_exposures, turn_with_cameras
+from mi_ring.photogrammetry.folder import DECODED, Picture, relative_exposures, turn_with_cameras
 from mi_ring.photogrammetry.marker_sheet import MarkerSheet, PaperSamples, SheetDetection, calibrate, sample_paper
 from mi_ring.photogrammetry.object_masks import SegmentedObject
 from mi_ring.photogrammetry.shading_trial import ASSUMED_ALBEDO
@@ -84,7 +84,7 @@ def find_sheet(
         def observe(picture: Picture) -> list | InputError | None:
             try:
                 detection = MarkerSheet(1.0).detect(picture.srgb())
-                paper = sample_paper(picture.linear(), detection) if detection else ()
+                paper = sample_paper(picture.pixels[:, :, :3], detection, picture.to_linear) if detection else ()
                 return [a.tolist() for a in (*detection, *paper)] if detection else None
             except InputError as error:
                 if isinstance(error.__cause__, ImportError):  # a package is missing: the file is fine
@@ -93,7 +93,7 @@ def find_sheet(
             finally:
                 picture.close()
 
-        results = list(progress(in_threads(observe, pictures), "sheet", len(pictures)))
+        results = list(progress(in_threads(observe, pictures, most=DECODED), "sheet", len(pictures)))
         if bad := [(p.path.name, error) for p, error in zip(pictures, results) if isinstance(error, InputError)]:
             names = ", ".join(name for name, _ in bad)
             more = f"{len(bad)} photographs cannot be read: {names}; repair or remove them"
