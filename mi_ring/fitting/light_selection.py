@@ -23,6 +23,8 @@ COARSE: dict[str, Any] = {
     **{name: getattr(Config(), name) for name in (
         "loss", "optimizer", "learning_rate", "muon_rate", "decay", "velocity_decay", "steps", "spp", "batch")},
 }  # fmt: skip
+#: Coarse fits at most, by `Config.light`; most of them only in doubt.
+FITS = {"auto": 8, "lamps": 6, "environment": 2, "turntable": 2}
 LAST = 12  #: last iterations of a coarse fit whose mean error counts
 ALIKE = 1.1  #: ratio of the lights' strengths above which a message is printed
 #: Another light than the scene's is chosen only if its error is below this share of the error with the scene's lights.
@@ -99,7 +101,8 @@ class CoarseFits:
         config = replace(self.config, **COARSE, weights=weights, light=lighting.kind, refine=refine)
         try:
             fit = Fit(self.capture, config, lighting=lighting)
-            iterations = progress(fit, f"trying {lighting}", fit.schedule.iterations, unit="iteration")
+            doing = f"light, coarse fit {len(self.errors) + 1} of at most {FITS[self.config.light]} ({lighting})"
+            iterations = progress(fit, doing, fit.schedule.iterations, unit="iteration")
             errors = [it.terms["rgb"] for it in iterations][-LAST:]
         except InputError as error:  # it diverged, or a lamp is inside the object: the light is another
             self.failures.append(error)
