@@ -18,6 +18,11 @@ class Statement(NamedTuple):
     exponent: float | None = None  #: linear = encoded ^ exponent; 2.2 stands for sRGB's curve
 
 
+def srgb_to_linear(v: np.ndarray) -> np.ndarray:
+    """Convert sRGB values to linear ones (IEC 61966-2-1), as float32."""
+    return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
 def primaries_profile(white: tuple, primaries: tuple, exponent: float = 1.0) -> bytes:
     """The profile of RGB with this white (x, y) and these primaries (x, y of red, green and blue).
 
@@ -26,9 +31,7 @@ def primaries_profile(white: tuple, primaries: tuple, exponent: float = 1.0) -> 
     places = [value for k in range(3) for value in (*primaries[2 * k : 2 * k + 2], 1.0)]
     curve: dict[str, Any] = {"gamma": exponent}
     if exponent == 2.2:
-        x = np.linspace(0, 1, 4096)
-        linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-        curve = {"transferfunction": (linear * 65535 + 0.5).astype(np.uint16)}
+        curve = {"transferfunction": (srgb_to_linear(np.linspace(0, 1, 4096)) * 65535 + 0.5).astype(np.uint16)}
     return imagecodecs.cms_profile("rgb", whitepoint=(*white, 1.0), primaries=tuple(places), **curve)
 
 
@@ -56,13 +59,9 @@ def coded_statement(primaries: int, curve: int) -> Statement:
 @lru_cache(maxsize=8)
 def is_usual(profile: bytes, linear: bool) -> bool:
     """Is a profile that of sRGB, or with `linear` that of linear radiance with sRGB's primaries?"""
-    if profile[16:20] == b"GRAY" and linear:
-        colours = np.linspace(0, 1, 64, dtype=np.float32)[:, None, None]
-    else:
-        axis = np.linspace(0, 1, 6, dtype=np.float32)
-        colours = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(36, 6, 3)
-    expected = colours if linear else np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    return bool(np.abs(transformed(colours, profile) - expected).max() < 2e-3)
+    axis = np.linspace(0, 1, 6, dtype=np.float32)
+    colours = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(36, 6, 3)
+    return bool(np.abs(transformed(colours, profile) - (colours if linear else srgb_to_linear(colours))).max() < 2e-3)
 
 
 def transformed(colours: np.ndarray, profile: bytes) -> np.ndarray:
@@ -100,24 +99,18 @@ def as_stated(pixels: np.ndarray, said: Statement) -> np.ndarray:
     count = 3 if pixels.shape[2] > 2 else 1
     colours = pixels[..., :count]
     full = 1.0 if kind == np.float32 else np.iinfo(kind).max
-    if said.profile:
-        if is_usual(said.profile, kind != np.uint8):
-            return pixels
+    usual = 2.2 if kind == np.uint8 else 1.0
+    if said.profile and not is_usual(said.profile, kind != np.uint8):
         linear = transformed(colours, said.profile)
-    elif said.exponent and (abs(said.exponent - 2.2) < 0.05) != (kind == np.uint8) and not (
-        said.exponent == 1 and kind != np.uint8
-    ):  # fmt: skip
+    elif not said.profile and said.exponent and abs(said.exponent - usual) > 0.05:
         value = colours if kind == np.float32 else np.arange(full + 1, dtype=np.float32) / np.float32(full)
-        if abs(said.exponent - 2.2) < 0.05:
-            value = np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4)
-        else:
-            value = np.maximum(value, 0) ** np.float32(said.exponent)
-        linear = value if kind == np.float32 else (value * 65535 + 0.5).astype(np.uint16)[colours]
+        srgb = abs(said.exponent - 2.2) < 0.05
+        linear = srgb_to_linear(value) if srgb else np.maximum(value, 0) ** np.float32(said.exponent)
+        linear = linear if kind == np.float32 else (linear * 65535 + 0.5).astype(np.uint16)[colours]
     else:
         return pixels
+    alpha = pixels[..., count:]
     if linear.dtype == np.uint16:
         linear[colours == full] = 65535
-        alpha = pixels[..., count:].astype(np.uint16) * np.uint16(65535 // full)
-    else:
-        alpha = pixels[..., count:]
-    return np.concatenate([linear, alpha.astype(linear.dtype)], -1)
+        alpha = alpha.astype(np.uint16) * np.uint16(65535 // full)
+    return np.concatenate([linear, alpha], -1) if alpha.size else linear

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.colour_profiles import as_stated
+from mi_ring.colour_profiles import srgb_to_linear as srgb_to_linear  # beside its inverse for those who read images
 from mi_ring.foreign import require_plausible_size
 from mi_ring.image_headers import RAW, TIFF, bits_of, exr_size, open_image, statement_of
 from mi_ring.system.files import write_file
@@ -24,11 +25,6 @@ from mi_ring.system.optional import need
 EXR_CHUNK = 256  #: rows of the largest chunk of an OpenEXR file; its reader allocates one for an image of one row, too
 
 Pictures = TypeVar("Pictures", np.ndarray, Tensor)
-
-
-def srgb_to_linear(v: np.ndarray) -> np.ndarray:
-    """Convert sRGB values to linear ones (IEC 61966-2-1), as float32."""
-    return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def linear_to_srgb(v: np.ndarray) -> np.ndarray:

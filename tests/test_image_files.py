@@ -2,6 +2,7 @@
 
 import json
 import struct
+import zlib
 from pathlib import Path
 
 import imagecodecs
@@ -341,6 +342,23 @@ def test_colours_that_are_said_without_a_profile(tmp_path, write, close):
         expected[:1, inside].repeat(len(found[2::scale]), 0),
         atol=close or 1e-3,
     )
+
+
+@pytest.mark.parametrize(("kind", "gamma", "exponent"), [
+    (np.uint16, 55556, 1.8), (np.uint16, 100000, 1.0), (np.uint16, 40000, 2.5), (np.uint8, 55556, 1.8),
+    (np.uint8, 100000, 1.0),
+])  # fmt: skip
+def test_any_gamma_of_png_is_obeyed_at_any_depth(tmp_path, kind, gamma, exponent):
+    """The chunk gAMA holds 100000 / exponent."""
+    full = np.iinfo(kind).max
+    encoded = (stripes() ** (1 / exponent) * full + 0.5).astype(kind)
+    chunk = b"gAMA" + struct.pack(">I", gamma)
+    png = imagecodecs.png_encode(encoded)
+    (tmp_path / "a.png").write_bytes(png[:33] + struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+                                     + png[33:])  # fmt: skip
+    pixels = pixels_of(tmp_path / "a.png", heed=True)
+    assert pixels.dtype == np.uint16
+    np.testing.assert_allclose(pixels / 65535, (encoded / full) ** exponent, atol=1e-4)
 
 
 def test_primaries_of_png_chunks(tmp_path):
