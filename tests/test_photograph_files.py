@@ -251,7 +251,34 @@ def test_masks_that_are_named_otherwise_are_told(tmp_path, capsys):
         convert.main(["metashape", str(path), str(tmp_path / "t.xml"), "--masks", str(tmp_path / "masks")])
 
 
+@pytest.mark.parametrize("place", ["masks", "silhouettes"])
+def test_one_mask_is_not_that_of_photographs_from_two_places(tmp_path, place):
+    """Photographs of two folders have equal names, and one folder of masks has none of the folders."""
+    shots = [{"file_path": f"images/{k}/1.png"} for k in "ab"]
+    source = transforms(tmp_path, {"fl_x": 70.0, "fl_y": 76.0}, shots, lambda k: noise(np.uint8, seed=k))
+    write(tmp_path / place / "1.png", np.full((SIZE[1], SIZE[0], 1), 9, np.uint8))
+    options = [] if place == "masks" else ["--masks", str(tmp_path / place)]
+    with pytest.raises(InputError, match="1.png: would be the mask of two photographs, '.*a/1.png' and '.*b/1.png'; "):
+        convert.main(["transforms", str(source), str(tmp_path / "s.xml"), *options])
+    file = source / "transforms.json"
+    content = json.loads(file.read_text())
+    content["frames"][1]["transform_matrix"] = content["frames"][0]["transform_matrix"]
+    file.write_text(json.dumps(content))
+    assert [int(mask[0, 0]) for mask in converted("transforms", source, tmp_path / "s.xml", *options).masks] == [9, 9]
+    for k in "ab":
+        write(tmp_path / place / k / "1.png", np.full((SIZE[1], SIZE[0], 1), ord(k), np.uint8))
+    scene = converted("transforms", source, tmp_path / "t.xml", *options)
+    assert [int(mask[0, 0]) for mask in scene.masks] == [ord("a"), ord("b")]
+
+
 # What is left out
+
+
+def test_photographs_in_another_folder_are_not_said_to_be_without_a_camera(tmp_path, capsys):
+    shots = [{"file_path": "../images/0.png"}]
+    transforms(tmp_path / "model", {"fl_x": 70.0, "fl_y": 76.0}, shots, lambda k: noise(np.uint8, seed=k))
+    convert.main(["transforms", str(tmp_path / "model"), str(tmp_path / "s.xml")])
+    assert "without a camera" not in capsys.readouterr().out
 
 
 def test_what_is_left_out_is_said(tmp_path, capsys):

@@ -1,5 +1,6 @@
 """What formats have in common that name the file of each photograph."""
 
+import os
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
@@ -54,8 +55,8 @@ class NamedPhotographs(Source):
         `relative`: is the path relative to the folder of SRC? Raises InputError, which begins with `what`, if the path
         may be that of several photographs.
         """
-        if relative and self.photographs is None and self.images is None and is_file(file := self.beside / path):
-            return file
+        if relative and self.photographs is None and self.images is None and is_file(self.beside / path):
+            return Path(os.path.normpath(self.beside / path))  # equal to the one in `available`
         try:
             found = self.photograph_files.find(path)[0]
         except InputError as error:
@@ -96,7 +97,7 @@ class NamedPhotographs(Source):
 
     def find_masks(self, frames: list[Frame]) -> None:
         """Give the frames their masks: from `masks`, otherwise alpha channels, or a folder of masks beside them."""
-        folder = self.masks
+        folder, root = self.masks, self.photograph_files.root
         if folder is not None and not folder.is_dir():
             raise InputError(f"{folder}: --masks: no such folder")
         if folder is None:
@@ -105,20 +106,21 @@ class NamedPhotographs(Source):
                     frame.mask = frame.image
             if all(frame.mask for frame in frames):
                 return
-            root = self.photograph_files.root
             places = dict.fromkeys(place / name for place in (root.parent, root) for name in MASKS)
             folder = next((place for place in places if place.is_dir() and place != root), None)
         if folder is None:
             return
         masks = PhotographFiles(images_below(folder), folder)
-        for frame in frames:
-            if frame.mask is not None and self.masks is None:
-                continue
-            image = frame.image
-            inside = image.is_relative_to(self.photograph_files.root)
-            said = image.relative_to(self.photograph_files.root).as_posix() if inside else image.name
-            frame.mask = masks.find(said)[0]
+        wanted = [frame for frame in frames if frame.mask is None or self.masks is not None]
+        paths = [f.image.relative_to(root).as_posix() if f.image.is_relative_to(root) else f.image.name for f in wanted]
+        found = [masks.find(path) for path in paths]
+        claims = {(file, frame.pose.tobytes()): (file, path, agrees)  # photographs from one place may share a mask
+                  for frame, path, (file, agrees) in zip(wanted, paths, found) if file}  # fmt: skip
+        lost = refuse_twins(claims.values(), "mask of two photographs", "put masks in folders like the photographs'")
+        for frame, path, (file, _) in zip(wanted, paths, found):
+            frame.mask = None if path in lost else file
             if frame.mask is None and self.masks is not None:
+                image = frame.image
                 raise InputError(f"{folder}: --masks: has no mask of {image.name}, such as {image.name}.png or "
                                  f"{image.stem}.png; give all, or leave the photograph out")  # fmt: skip
         used = {frame.mask for frame in frames}

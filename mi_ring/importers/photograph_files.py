@@ -3,7 +3,7 @@
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from mi_ring.errors import InputError
@@ -89,11 +89,15 @@ class PhotographFiles:
         return found[0], not contrary
 
 
-def refuse_twins(claims: Sequence[tuple[Path, str, bool]]) -> set[str]:
+def refuse_twins(
+    claims: Iterable[tuple[Path, str, bool]],
+    what: str = "photograph of two cameras",
+    advice: str = "give --images, the folder that the paths of the cameras begin in",
+) -> set[str]:
     """The paths whose file belongs to another path, for files that were found for several paths.
 
     `claims`: file, path, and whether the folders of both agree. Raises InputError if two paths have equal right to a
-    file.
+    file. `what` it would be, and `advice`: for the message.
     """
     by_file: dict[Path, list[tuple[str, bool]]] = defaultdict(list)
     for file, path, agrees in claims:
@@ -104,7 +108,6 @@ def refuse_twins(claims: Sequence[tuple[Path, str, bool]]) -> set[str]:
             continue
         first = [path for path, agrees in paths if agrees] or [path for path, _ in paths]
         if len(first) > 1:
-            raise InputError(f"{file}: would be the photograph of two cameras, {first[0]!r} and {first[1]!r}; give "
-                             "--images, the folder that the paths of the cameras begin in")  # fmt: skip
+            raise InputError(f"{file}: would be the {what}, {first[0]!r} and {first[1]!r}; {advice}")
         lost |= {path for path, _ in paths} - {*first}
     return lost
