@@ -196,7 +196,7 @@ BROKEN = {
     "open domain": (all_of(open_mesh, xml(SHAPE, SHAPE + '<string name="domain" value="open.ply"/>')), [],
                     ["open.ply: domain: is not a closed surface"]),
     "picture as domain": (lambda path: None, ["--domain", "mesh", "{folder}/images/000.png"],
-                          ["000.png: --domain: cannot be read"]),
+                          ["000.png: --domain: is no mesh in a format that is read; save it as PLY"]),
     "hull without masks": (xml('<string name="mask"[^>]*>', "", 0), ["--domain", "hull", "--masks", "given"],
                            ["small.xml", "--domain hull", "masks"]),
     "nothing to resume": (lambda path: None, ["--resume"], ["checkpoint.pt", "--resume"]),

@@ -382,8 +382,10 @@ def test_names_that_scene_files_cannot_have(tmp_path):
 def test_compressed_tiffs(compression, tmp_path):
     tifffile = pytest.importorskip("tifffile")
     pixels = np.full((48, 64, 3), (90, 120, 30), np.uint8)
-    tifffile.imwrite(tmp_path / "a.tif", np.stack([pixels, pixels // 2]), compression=compression, photometric="rgb")
-    np.testing.assert_array_equal(Picture(tmp_path / "a.tif").srgb(), pixels)  # its first page
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(pixels, compression=compression, photometric="rgb")
+        file.write(pixels[::2, ::2] // 2, compression=compression, photometric="rgb", subfiletype=1)  # a thumbnail
+    np.testing.assert_array_equal(Picture(tmp_path / "a.tif").srgb(), pixels)
 
 
 def test_a_photograph_must_not_be_called_like_the_surface(tmp_path):
