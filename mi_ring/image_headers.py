@@ -102,6 +102,21 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
+def has_alpha_channel(path: Path) -> bool:
+    """Has an image file an alpha channel? Raises the same errors as `open_image`."""
+    suffix = path.suffix.lower()
+    if suffix in (".jpg", ".jpeg", *RAW):
+        return False
+    if suffix == ".exr":
+        names = exr_channels(dict(exr_attributes(path))[b"channels"])
+        return any(name.rpartition(".")[2] == "A" for name in names)
+    if suffix in TIFF:
+        with tifffile.TiffFile(path) as file:
+            return file.pages.first.samplesperpixel in (2, 4)
+    with open_image(path) as image:
+        return image.has_transparency_data
+
+
 def statement_of(path: Path) -> Statement:
     """What an image file says about its colours. Raises the same errors as `open_image`.
 

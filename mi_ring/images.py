@@ -118,15 +118,15 @@ def read_tiff(path: Path) -> np.ndarray:
         if pixels.dtype == bool:
             pixels = pixels.astype(np.uint8) * np.uint8(255)
         elif pixels.dtype.kind == "u" and (bits := page.bitspersample) not in (8, 16):  # stored in the low bits
-            full = np.iinfo(pixels.dtype).max
-            pixels = (pixels.astype(np.float32) * (full / (2**bits - 1)) + 0.5).astype(pixels.dtype)
+            values = np.arange(2**bits) * (np.iinfo(pixels.dtype).max / (2**bits - 1)) + 0.5
+            pixels = values.astype(pixels.dtype)[pixels]
         if page.photometric == kinds.MINISWHITE:
             pixels = np.iinfo(pixels.dtype).max - pixels if pixels.dtype.kind == "u" else 1 - pixels
         if page.extrasamples[:1] == (tifffile.EXTRASAMPLE.ASSOCALPHA,) and pixels.dtype.kind == "u":
             full, alpha = np.iinfo(pixels.dtype).max, pixels[..., -1:].astype(np.float32)
             colours = (pixels[..., :-1] * (full / np.maximum(alpha, 1)) + 0.5).clip(0, full).astype(pixels.dtype)
             pixels = np.concatenate([colours, pixels[..., -1:]], -1)
-    return pixels.astype(np.float32) if pixels.dtype.kind == "f" else pixels
+    return pixels.astype(np.float32, copy=False) if pixels.dtype.kind == "f" else pixels
 
 
 def read_exr(path: Path) -> np.ndarray:
@@ -139,7 +139,7 @@ def read_exr(path: Path) -> np.ndarray:
     with exr_threads():
         bitmap = mi.Bitmap(str(path))
     names = [field.name for field in bitmap.struct_()]  # type: ignore[attr-defined]
-    pixels = np.array(bitmap, copy=True).astype(np.float32).reshape(height, width, len(names))
+    pixels = np.asarray(bitmap).reshape(height, width, len(names))
     layers = [name.removesuffix("R") for name in names if name == "R" or name.endswith(".R")]
     layers = [layer for layer in layers if {f"{layer}{c}" for c in "RGB"} <= {*names}]
     layers = [""] if "" in layers else layers
@@ -149,7 +149,8 @@ def read_exr(path: Path) -> np.ndarray:
     wanted = [f"{layers[0]}{c}" for c in "RGBA"] if layers else ["Y", "A"] if "Y" in names else names
     if not layers and "Y" not in names and (len(names) > 1 or names[0].rpartition(".")[2] in ("Z", "depth")):
         raise ValueError(f"has channels {', '.join(names[:6])}, but no R, G, B; save the photograph alone")
-    return pixels[..., [names.index(name) for name in wanted if name in names]]
+    # This copies once: the bitmap's memory ends with the bitmap.
+    return pixels[..., [names.index(name) for name in wanted if name in names]].astype(np.float32, copy=False)
 
 
 def read_raw(path: Path) -> np.ndarray:
