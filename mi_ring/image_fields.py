@@ -5,7 +5,7 @@ from pathlib import Path
 import tifffile
 
 from mi_ring.fields import Fields
-from mi_ring.image_headers import HEIF, RAW, TIFF, exr_attributes, exr_channels, open_image, png_chunks
+from mi_ring.image_headers import HEIF, RAW, TIFF, exr_attributes, exr_channels, exr_picture, open_image, png_chunks
 
 ANIMATED = "further pictures; the first is read"
 TIFF_COLOURS = "WhitePoint PrimaryChromaticities TransferFunction"
@@ -57,7 +57,7 @@ FIELDS = {
     ),
     "OpenEXR": Fields(
         used={
-            "channels channel:R channel:G channel:B channel:A channel:Y": "pixels",
+            "channels": "pixels: R, G, B, A, of one layer, or Y, A, or the only channel",
             "dataWindow displayWindow compression lineOrder tiles type version chunkCount": "pixels",
             "chromaticities": "colours; without it sRGB's primaries",
         },
@@ -103,9 +103,9 @@ def field_names(path: Path) -> tuple[str, list[str]]:
     suffix = path.suffix.lower()
     if suffix == ".exr":
         attributes = dict(exr_attributes(path))
-        channels = used_first(exr_channels(attributes[b"channels"]))
-        names = [name.decode("utf-8", "replace") for name in attributes]
-        return "OpenEXR", names + [f"channel:{name}" for name in channels]
+        channels = exr_channels(attributes[b"channels"])
+        others = [name for name in channels if name not in exr_picture(channels)]
+        return "OpenEXR", [*(name.decode("utf-8", "replace") for name in attributes), *map("channel:{}".format, others)]
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:
             return "TIFF", [tag.name for tag in file.pages.first.tags]
@@ -118,15 +118,6 @@ def field_names(path: Path) -> tuple[str, list[str]]:
             segments = getattr(image, "applist", [])
             return "JPEG", [f"{place}:{own[:40].split(bytes(1))[0].decode('latin-1')}" for place, own in segments]
         return "WebP, AVIF, HEIF, BMP", [str(name) for name in image.info]
-
-
-def used_first(channels: list[str]) -> list[str]:
-    """The names of channels; those of the layer that is read without the layer's name."""
-    layers = [name.removesuffix("R") for name in channels if name.endswith(".R")]
-    if len(layers) != 1 or "R" in channels:
-        return channels
-    return [name.removeprefix(layers[0]) if name[len(layers[0]) :] in ("R", "G", "B", "A") else name
-            for name in channels]  # fmt: skip
 
 
 def unused_fields(path: Path) -> dict[str, str]:

@@ -9,6 +9,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tifffile
@@ -102,6 +103,21 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
+def has_alpha_channel(path: Path) -> bool:
+    """Has an image file an alpha channel? Raises the same errors as `open_image`."""
+    suffix = path.suffix.lower()
+    if suffix in (".jpg", ".jpeg", *RAW):
+        return False
+    if suffix == ".exr":
+        names = exr_channels(dict(exr_attributes(path))[b"channels"])
+        return any(name.rpartition(".")[2] == "A" for name in names)
+    if suffix in TIFF:
+        with tifffile.TiffFile(path) as file:
+            return file.pages.first.samplesperpixel in (2, 4)
+    with open_image(path) as image:
+        return image.has_transparency_data
+
+
 def statement_of(path: Path) -> Statement:
     """What an image file says about its colours. Raises the same errors as `open_image`.
 
@@ -175,14 +191,13 @@ def encodings(paths: Sequence[Path]) -> list[str]:
     """How the pixels of image files are encoded, as a clause for each kind."""
     bits = Counter(bits_of(path) for path in paths)
     said = sum(statement_of(path) != Statement() for path in paths)
-    found = [f"{bits[8]} files of 8 bits are sRGB"] if bits[8] else []
-    found += [f"{bits[16]} files of 16 bits are linear"] if bits[16] else []
-    found += [f"{bits[32]} files of floats are linear"] if bits[32] else []
+    kinds = {8: "8 bits are sRGB", 16: "16 bits are linear", 32: "floats are linear"}
+    found = [f"{bits[depth]} files of {what}" for depth, what in kinds.items() if bits[depth]]
     return found + ([f"except as {said} of the files say themselves"] if said else [])
 
 
-def encoding_of(path: Path) -> str:
-    """The encoding of the pixels that `read_image` gives with `heed`: srgb or linear."""
+def encoding_of(path: Path) -> Literal["srgb", "linear"]:
+    """The encoding of the pixels that `read_image` gives with `heed`."""
     said = statement_of(path)
     sample = np.zeros((1, 1, 3), np.uint8)
     return "srgb" if bits_of(path) == 8 and as_stated(sample, said).dtype == np.uint8 else "linear"
@@ -219,6 +234,24 @@ def exr_channels(value: bytes) -> list[str]:
         names.append(value[place:end].decode("utf-8", "replace"))
         place = end + 17
     return names
+
+
+def exr_picture(names: Sequence[str]) -> list[str]:
+    """Which of an OpenEXR file's channels are the picture: R, G, B and A; Y and A; or its only channel.
+
+    Names may begin with that of a layer, as in `ViewLayer.Combined.R`, if one layer alone has R, G and B. Raises
+    ValueError if none is the picture, or several layers are.
+    """
+    layers = [name.removesuffix("R") for name in names if name == "R" or name.endswith(".R")]
+    layers = [layer for layer in layers if {f"{layer}{c}" for c in "RGB"} <= {*names}]
+    layers = [""] if "" in layers else layers
+    if len(layers) > 1:
+        raise ValueError(f"has the layers {', '.join(layer.rstrip('.') for layer in layers[:6])}; save the one of the "
+                         "photograph alone")  # fmt: skip
+    wanted = [f"{layers[0]}{c}" for c in "RGBA"] if layers else ["Y", "A"] if "Y" in names else names
+    if not layers and "Y" not in names and (len(names) > 1 or names[0].rpartition(".")[2] in ("Z", "depth")):
+        raise ValueError(f"has channels {', '.join(names[:6])}, but no R, G, B; save the photograph alone")
+    return [name for name in wanted if name in names]
 
 
 def exr_size(path: Path) -> tuple[int, int, int]:

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from mi_ring.colour_profiles import as_stated
 from mi_ring.colour_profiles import srgb_to_linear as srgb_to_linear  # beside its inverse for those who read images
 from mi_ring.foreign import require_plausible_size
-from mi_ring.image_headers import RAW, TIFF, bits_of, exr_size, open_image, statement_of
+from mi_ring.image_headers import RAW, TIFF, bits_of, exr_picture, exr_size, open_image, statement_of
 from mi_ring.system.files import write_file
 from mi_ring.system.machine import exr_threads
 from mi_ring.system.optional import need
@@ -118,38 +118,27 @@ def read_tiff(path: Path) -> np.ndarray:
         if pixels.dtype == bool:
             pixels = pixels.astype(np.uint8) * np.uint8(255)
         elif pixels.dtype.kind == "u" and (bits := page.bitspersample) not in (8, 16):  # stored in the low bits
-            full = np.iinfo(pixels.dtype).max
-            pixels = (pixels.astype(np.float32) * (full / (2**bits - 1)) + 0.5).astype(pixels.dtype)
+            values = np.arange(2**bits) * (np.iinfo(pixels.dtype).max / (2**bits - 1)) + 0.5
+            pixels = values.astype(pixels.dtype)[pixels]
         if page.photometric == kinds.MINISWHITE:
             pixels = np.iinfo(pixels.dtype).max - pixels if pixels.dtype.kind == "u" else 1 - pixels
         if page.extrasamples[:1] == (tifffile.EXTRASAMPLE.ASSOCALPHA,) and pixels.dtype.kind == "u":
             full, alpha = np.iinfo(pixels.dtype).max, pixels[..., -1:].astype(np.float32)
             colours = (pixels[..., :-1] * (full / np.maximum(alpha, 1)) + 0.5).clip(0, full).astype(pixels.dtype)
             pixels = np.concatenate([colours, pixels[..., -1:]], -1)
-    return pixels.astype(np.float32) if pixels.dtype.kind == "f" else pixels
+    return pixels.astype(np.float32, copy=False) if pixels.dtype.kind == "f" else pixels
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """The channels R, G, B and A of an OpenEXR file, Y and A, or its only channel: float32.
-
-    Names may begin with that of a layer, as in `ViewLayer.Combined.R`, if one layer alone has R, G and B.
-    """
+    """The pixels in the channels `exr_picture` of an OpenEXR file: float32."""
     width, height, channels = exr_size(path)
     require_plausible_size(path, 4 * width * max(height, EXR_CHUNK) * channels)
     with exr_threads():
         bitmap = mi.Bitmap(str(path))
     names = [field.name for field in bitmap.struct_()]  # type: ignore[attr-defined]
-    pixels = np.array(bitmap, copy=True).astype(np.float32).reshape(height, width, len(names))
-    layers = [name.removesuffix("R") for name in names if name == "R" or name.endswith(".R")]
-    layers = [layer for layer in layers if {f"{layer}{c}" for c in "RGB"} <= {*names}]
-    layers = [""] if "" in layers else layers
-    if len(layers) > 1:
-        raise ValueError(f"has the layers {', '.join(layer.rstrip('.') for layer in layers[:6])}; save the one of the "
-                         "photograph alone")  # fmt: skip
-    wanted = [f"{layers[0]}{c}" for c in "RGBA"] if layers else ["Y", "A"] if "Y" in names else names
-    if not layers and "Y" not in names and (len(names) > 1 or names[0].rpartition(".")[2] in ("Z", "depth")):
-        raise ValueError(f"has channels {', '.join(names[:6])}, but no R, G, B; save the photograph alone")
-    return pixels[..., [names.index(name) for name in wanted if name in names]]
+    pixels = np.asarray(bitmap).reshape(height, width, len(names))
+    # This copies once: the bitmap's memory ends with the bitmap.
+    return pixels[..., [names.index(name) for name in exr_picture(names)]].astype(np.float32, copy=False)
 
 
 def read_raw(path: Path) -> np.ndarray:

@@ -87,7 +87,7 @@ def test_pictures_that_declare_to_be_enormous(name, write, tmp_path, monkeypatch
     for reader in ((mi, "Bitmap"), (images.tifffile.TiffPage, "asarray"), (ImageFile.ImageFile, "load")):
         monkeypatch.setattr(*reader, lambda *_, **__: pytest.fail("was asked"))
     for ask in (pixels_of, has_alpha, exif_values):
-        if (ask is exif_values and name in ("a.exr", "a.tif")) or (ask is has_alpha and name == "a.jpg"):
+        if (ask is exif_values and name in ("a.exr", "a.tif")) or (ask is has_alpha and name != "a.png"):
             assert not ask(path)  # says so without pixels
             continue
         with pytest.raises(InputError, match=rf"{name}: cannot be read as image \(declares [\d,]+ bytes, in a file of"):

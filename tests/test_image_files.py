@@ -431,6 +431,15 @@ def test_colours_of_palettes_and_their_alpha(tmp_path):
     assert not has_alpha(tmp_path / "b.png")  # opaque: says nothing
 
 
+@pytest.mark.parametrize("write", [
+    by_tiff(photometric="rgb"), exr_of("R", "G", "B"), exr_of("R", "G", "B", "Z"), by_pillow(".jpg"), by_pillow(".png"),
+])  # fmt: skip
+def test_whether_there_is_alpha_is_seen_without_pixels(tmp_path, monkeypatch, write):
+    write(tmp_path / "a", stripes())
+    monkeypatch.setattr(images, "read_image", lambda *_: pytest.fail("was asked"))
+    assert not has_alpha(next(tmp_path.iterdir()))
+
+
 def test_a_mask_may_be_in_the_alpha_channel_of_its_file():
     colours, alpha = np.full((2, 3, 3), 90, np.uint8), np.array([[0, 255, 0], [255, 0, 128]], np.uint8)
     assert (images.mask_values(np.dstack([colours, alpha])) == alpha).all()

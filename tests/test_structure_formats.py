@@ -284,7 +284,7 @@ def test_photographs_of_record3d_may_be_reduced_and_padded(tmp_path):
     (dict.clear, "metadata.json: w, h: "),
     (lambda own: own.update(poses=3), "poses: found none; must be a list of 7 numbers"),
     (lambda own: own["poses"].__setitem__(1, [1, 2]), r"poses\[1\]: is of shape \(2,\); must be 7 numbers"),
-    (lambda own: own["poses"].__setitem__(1, [0] * 7), r"poses\[1\]: its quaternion is of length 0; must be 1"),
+    (lambda own: own["poses"].__setitem__(1, [0] * 7), r"poses\[1\]: its quaternion: is of length 0; must be 1"),
     (lambda own: own["perFrameIntrinsicCoeffs"].pop(), r"perFrameIntrinsicCoeffs: is of shape \(2, 4\); must be 3 x 4"),
     (lambda own: own.update(perFrameIntrinsicCoeffs=None, K=[1]), r"K: is \[1\]; must be 9 numbers"),
     (lambda own: own.update(perFrameIntrinsicCoeffs=None, K=[70, 0, 28, 0, 76, 27, 0, 0, 1]), "K: is .*by columns"),

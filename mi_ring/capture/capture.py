@@ -256,17 +256,11 @@ class Capture:
     def silhouettes(self, most: int | None = None) -> list[Silhouette]:
         """The reduced masks with their cameras, without duplicates; at most `most`, evenly spaced."""
         return [
-            small_silhouette(
-                Silhouette(
-                    self.masks[k],
-                    self.shots[k].camera,
-                    self.outline(k),
-                    self.valid[k],
-                    self.shots[k].frame if self.shots[k].window else None,
-                )
-            )
+            small_silhouette(Silhouette(
+                self.masks[k], self.shots[k].camera, self.outline(k), self.valid[k],
+                self.shots[k].frame if self.shots[k].window else None))
             for k in self._outlined(most)
-        ]
+        ]  # fmt: skip
 
     def _outlined(self, most: int | None) -> list[int]:
         """Indices of the photographs that `silhouettes` uses."""

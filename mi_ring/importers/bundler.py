@@ -34,12 +34,7 @@ class Bundler(Photogrammetry):
         harmless={"points": "the surface starts from masks", "list.txt:focal": "where the program began"},
     )
 
-    @property
-    def cameras(self) -> Path:
-        """The file of the cameras."""
-        if not self.src.is_dir():
-            return self.src
-        return first_file([self.src / "bundle.out", self.src / "bundle" / "bundle.out"], "SRC")
+    names = "bundle.out", "bundle/bundle.out"
 
     @property
     def listed(self) -> Path:
@@ -65,7 +60,7 @@ class Bundler(Photogrammetry):
             elif image := self.photograph(name, str(listed), relative=True):
                 size = image_size(image)
                 lens = opencv_lens(size, (f, f, size[0] / 2, size[1] / 2), (k1, k2, 0.0), (0.0, 0.0))
-                yield Frame(image, lens, camera_to_world(matrix(R, (3, 3), name), t) @ OPENGL, said=name)
+                yield Frame(image, lens, camera_to_world(np.array(R), t) @ OPENGL, said=name)
 
 
 def read_cameras(path: Path) -> np.ndarray:

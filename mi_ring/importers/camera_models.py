@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
+from mi_ring.importers.reading import matrix
 from mi_ring.system.optional import need
 
 MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  #: from Mitsuba's camera axes (x left, y up, z forward) to OpenCV's
@@ -97,11 +99,22 @@ def opencv_lens(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: S
     return Lens("FULL_OPENCV", (size[0], size[1]), (*intrinsics, *k[:2], *p, k[2], 0, 0, 0))
 
 
+def pose_of(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) whose rotation is R (3, 3) and whose place is t (3,)."""
+    return np.block([[R, np.reshape(t, (3, 1))], [np.eye(4)[3:]]])
+
+
+def rotation_of(quaternion: object, what: str) -> np.ndarray:
+    """The rotation (3, 3) of a quaternion x y z w. Raises InputError, which begins with `what`, if it is no unit."""
+    numbers = matrix(quaternion, (4,), what)
+    if abs(length := np.linalg.norm(numbers) - 1) > 1e-2:
+        raise InputError(f"{what}: is of length {length + 1:.3g}; must be 1")
+    return Rotation.from_quat(numbers).as_matrix()
+
+
 def camera_to_world(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     """The pose (4, 4) of a camera whose world-to-camera map is x ↦ R x + t."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
-    return pose
+    return pose_of(R.T, -R.T @ t)
 
 
 def decompose_projection(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:

@@ -72,8 +72,8 @@ def begins(path: Path, word: bytes) -> bool:
 #: In the order in which `detect` takes them.
 SIGNS = (
     Sign("colmap", "a model of COLMAP", (), Colmap.model),
-    Sign("transforms", "transforms.json", ("transforms.json", "transforms_train.json"),
-         lambda path: path.stem in ("transforms", "transforms_train") or has("frames")(path)),
+    Sign("transforms", "transforms.json", Transforms.names,
+         lambda path: path.name in Transforms.names or has("frames")(path)),
     Sign("metashape", "*.xml of Metashape", ("*.xml",), lambda path: find_chunk(load_xml(path)) is not None),
     Sign("realitycapture", "*.xmp or *.csv of RealityCapture", (), has_sidecars),
     Sign("realitycapture", "", ("*.csv",), lambda path: {"name", *POSE, "f"} <= {*read_csv(path)[0]}),
@@ -81,16 +81,16 @@ SIGNS = (
     Sign("middlebury", "*_par.txt", ("*_par.txt",), lambda path: path.name.endswith("_par.txt")),
     Sign("sfmdata", "*.sfm or sfm_data.json", ("cameras.sfm", "sfm.json", "sfm_data.json", "*.sfm"),
          has("poses", "extrinsics")),
-    Sign("bundler", "bundle.out", ("bundle.out", "bundle/bundle.out", "*.bundle.out", "bundle.rd.out"),
+    Sign("bundler", "bundle.out", (*Bundler.names, "*.bundle.out", "bundle.rd.out"),
          lambda path: begins(path, FIRST_LINE.encode())),
     Sign("visualsfm", "*.nvm", ("*.nvm",), lambda path: begins(path, b"NVM_V3")),
-    Sign("opensfm", "reconstruction.json", ("reconstruction.json", "opensfm/reconstruction.json"),
+    Sign("opensfm", "reconstruction.json", OpenSfm.names,
          lambda path: isinstance(top := load_json(path), list) and isinstance(top[0], dict) and "shots" in top[0]),
     Sign("polycam", "keyframes of Polycam", (), has_keyframes),
     Sign("record3d", "metadata.json of Record3D", (), lambda path: has("poses")(path / "metadata.json")),
     Sign("gltf", "*.glb or *.gltf with cameras", ("*.glb", "*.gltf"), has_cameras),
     Sign("neus", "cameras_sphere.npz", (), has_files("cameras_sphere.npz", "cameras.npz")),
-    Sign("iron", "cam_dict_norm.json", (), has_files("cam_dict_norm.json", "train/cam_dict_norm.json")),
+    Sign("iron", "cam_dict_norm.json", (), has_files(*Iron.names)),
     Sign("diligent-mv", "Calib_Results.mat", (), has_files("Calib_Results.mat")),
 )  # fmt: skip
 

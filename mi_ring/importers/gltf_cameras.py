@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pygltflib
-from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.fields import Fields
-from mi_ring.importers.camera_models import Lens
+from mi_ring.importers.camera_models import Lens, pose_of, rotation_of
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, matrix, read_as
@@ -52,13 +51,11 @@ class GltfCameras(Photogrammetry):
         for k in found:
             node = gltf.nodes[k]
             camera = entry(gltf.cameras, node.camera, f"{self.src}: nodes[{k}].camera")
-            names = dict.fromkeys(
-                str(own) for own in (node.name, str(node.name).removesuffix(CHILD), camera.name) if own
-            )
-            what = f"{self.src}: camera {next(iter(names), '')!r}"
-            if not names:
-                raise InputError(f"{what}: nodes[{k}].name: is missing; must be the name of a photograph")
-            name = next((own for own in names if self.photograph_files.find(own)[0]), next(iter(names)))
+            names = [str(own) for own in (node.name, str(node.name).removesuffix(CHILD), camera.name) if own]
+            if not node.name and not camera.name:
+                raise InputError(f"{self.src}: nodes[{k}].name: is missing; must be the name of a photograph")
+            what = f"{self.src}: camera {names[0]!r}"
+            name = next((own for own in names if self.photograph_files.find(own)[0]), names[0])
             if (image := self.photograph(name, what)) is None:
                 continue
             if camera.perspective is None:
@@ -106,14 +103,9 @@ def transform_of(node: pygltflib.Node, what: str) -> np.ndarray:
     """The transform (4, 4) of a node to its parent: its matrix, which is by columns, or its three parts."""
     if node.matrix is not None:
         return matrix(node.matrix, (16,), f"{what}.matrix").reshape(4, 4).T
-    place = np.eye(4)
-    quaternion = matrix(node.rotation or [0, 0, 0, 1], (4,), f"{what}.rotation")
-    if abs(np.linalg.norm(quaternion) - 1) > 1e-2:
-        raise InputError(f"{what}.rotation: is of length {np.linalg.norm(quaternion):.3g}; must be 1")
+    R = rotation_of(node.rotation or [0, 0, 0, 1], f"{what}.rotation")
     scale = matrix(node.scale or [1, 1, 1], (3,), f"{what}.scale")
-    place[:3, :3] = Rotation.from_quat(quaternion).as_matrix() * scale
-    place[:3, 3] = matrix(node.translation or [0, 0, 0], (3,), f"{what}.translation")
-    return place
+    return pose_of(R * scale, matrix(node.translation or [0, 0, 0], (3,), f"{what}.translation"))
 
 
 def rigid(place: np.ndarray, what: str) -> np.ndarray:
@@ -122,9 +114,7 @@ def rigid(place: np.ndarray, what: str) -> np.ndarray:
     if not scale > 0 or not np.allclose(place[:3, :3].T @ place[:3, :3], scale**2 * np.eye(3), atol=1e-4 * scale**2):
         raise InputError(f"{what}: scale: it and its parents scale axes differently, or mirror; apply the scales in "
                          "Blender")  # fmt: skip
-    pose = place.copy()
-    pose[:3, :3] /= scale
-    return pose
+    return pose_of(place[:3, :3] / scale, place[:3, 3])
 
 
 def lens_of(perspective: pygltflib.Perspective, image: Path, what: str) -> Lens:

@@ -9,7 +9,7 @@ from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.named_photographs import NamedPhotographs
-from mi_ring.importers.reading import first_file, image_size, load_json, matrix
+from mi_ring.importers.reading import image_size, load_json, matrix
 
 
 @dataclass(frozen=True)
@@ -21,14 +21,11 @@ class Iron(NamedPhotographs):
 
     fields = Fields(used={"K": "calibration matrix", "W2C": "pose, world-to-camera", "img_size": "of the photograph"})
 
-    @property
-    def cameras(self) -> Path:
-        """The file of the cameras."""
-        return first_file([f / "cam_dict_norm.json" for f in (self.src, self.src / "train")], "SRC")
+    names = "cam_dict_norm.json", "train/cam_dict_norm.json"
 
     @property
     def folder(self) -> Path:
-        return self.images or self.cameras.parent / "image"
+        return self.images or self.beside / "image"
 
     def posed(self) -> Iterator[Frame]:
         path = self.cameras

@@ -9,7 +9,7 @@ import numpy as np
 from mi_ring.errors import InputError
 from mi_ring.fields import Fields, xml_names
 from mi_ring.geometry.camera import moved_pose
-from mi_ring.importers.camera_models import Lens, opencv_lens
+from mi_ring.importers.camera_models import Lens, opencv_lens, pose_of
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_xml, matrix
@@ -144,10 +144,7 @@ def in_rig(sensor: ElementTree.Element, master: ElementTree.Element, what: str) 
     if sensor.get("master_id") != master.get("sensor_id"):
         raise InputError(f"{what}: master_id: is {sensor.get('master_id')!r}, but the master of its camera has sensor "
                          f"{master.get('sensor_id')!r}; export the cameras as COLMAP or Bundler")  # fmt: skip
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = (numbers(sensor, name, shape, what)
-                                 for name, shape in (("rotation", (3, 3)), ("location", (3,))))  # fmt: skip
-    return pose
+    return pose_of(numbers(sensor, "rotation", (3, 3), what), numbers(sensor, "location", (3,), what))
 
 
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:

@@ -5,16 +5,19 @@ from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
 from mi_ring.errors import InputError, is_file
 from mi_ring.importers.frames import Frame, Source
 from mi_ring.importers.photograph_files import MASKS, PhotographFiles, name_of, refuse_twins
-from mi_ring.importers.reading import has_alpha, images_below
+from mi_ring.importers.reading import first_file, has_alpha, images_below
 
 
 @dataclass(frozen=True)
 class NamedPhotographs(Source):
     """Base of the formats that name the file of each photograph. Each format implements `posed`."""
+
+    names: ClassVar[tuple[str, ...]] = ()  #: of the file of cameras, where SRC is a folder
 
     images: Path | None = None
     """Folder of the photographs. Without it: where the file says, or the nearest folder `images` beside or above SRC.
@@ -28,9 +31,14 @@ class NamedPhotographs(Source):
         raise NotImplementedError
 
     @property
+    def cameras(self) -> Path:
+        """The file of the cameras: SRC, or one of `names` in it. Raises InputError if there is none."""
+        return first_file([self.src / name for name in self.names], "SRC") if self.src.is_dir() else self.src
+
+    @property
     def beside(self) -> Path:
-        """The folder of SRC, or SRC itself if it is a folder."""
-        return self.src if self.src.is_dir() else self.src.parent
+        """The folder of `cameras`; SRC if that is a folder, and the format does not have one file of cameras."""
+        return self.src if self.src.is_dir() and not self.names else self.cameras.parent
 
     @property
     def folder(self) -> Path:

@@ -13,7 +13,7 @@ from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import first_file, image_size, load_json, matrix, require_object
+from mi_ring.importers.reading import image_size, load_json, matrix, require_object
 
 #: The coefficients of each projection type that is supported. Of others, "dual" and "fisheye62" are lenses of their
 #: own, and "spherical" is a panorama.
@@ -49,16 +49,7 @@ class OpenSfm(Photogrammetry):
         },
     )  # fmt: skip
 
-    @property
-    def cameras(self) -> Path:
-        """The file of the cameras."""
-        if not self.src.is_dir():
-            return self.src
-        return first_file([folder / "reconstruction.json" for folder in (self.src, self.src / "opensfm")], "SRC")
-
-    @property
-    def beside(self) -> Path:
-        return self.cameras.parent
+    names = "reconstruction.json", "opensfm/reconstruction.json"
 
     def posed(self) -> Iterator[Frame]:
         path = self.cameras
@@ -69,20 +60,20 @@ class OpenSfm(Photogrammetry):
         shots = [require_object(own.get("shots"), f"{path}: [{k}].shots") for k, own in enumerate(models)]
         best = self.largest(shots, "reconstructions")
         cameras = require_object(models[best].get("cameras"), f"{path}: [{best}].cameras")
-        names = [*models[best]]
+        said = [*models[best]]
         for name, shot in sorted(shots[best].items()):
             what = f"{path}: shots {name[:99]!r}"
             turn = matrix(require_object(shot, what).get("rotation"), (3,), f"{what}.rotation")
             shift = matrix(shot.get("translation"), (3,), f"{what}.translation")
-            names += [f"shots/{key}" for key in shot]
+            said += [f"shots/{key}" for key in shot]
             if image := self.photograph(name, what):
                 camera = require_object(cameras.get(str(shot.get("camera"))), f"{what}.camera")
                 lens = opensfm_lens(camera, image, f"{path}: cameras {str(shot['camera'])[:99]!r}")
                 kind = str(camera.get("projection_type", "perspective"))
                 terms = {term for own in TERMS.values() for term in own}.difference(TERMS[kind])  # of other kinds
-                names += [f"cameras/{kind}/{key}" if key in terms else f"cameras/{key}" for key in camera]
+                said += [f"cameras/{kind}/{key}" if key in terms else f"cameras/{key}" for key in camera]
                 yield Frame(image, lens, camera_to_world(Rotation.from_rotvec(turn).as_matrix(), shift), said=name)
-        self.tell_unused(path, names)
+        self.tell_unused(path, said)
 
 
 def opensfm_lens(given: dict[str, Any], image: Path, what: str) -> Lens:

@@ -55,7 +55,7 @@ class Polycam(Photogrammetry):
         if not self.corrected:
             self.notes.append(f"{folder}: Polycam has not corrected these cameras; they are those of the phone, which "
                               "are less exact")  # fmt: skip
-        names: list[str] = []
+        said: list[str] = []
         for path in files:
             given = require_object(load_json(path), str(path))
             if (image := self.photograph(f"{path.stem}.jpg", str(path))) is None:
@@ -63,7 +63,7 @@ class Polycam(Photogrammetry):
             numbers = [float(matrix(given.get(name), (), f"{path}: {name}")) for name in USED]
             pose = np.vstack([np.reshape(numbers[:12], (3, 4)), [0, 0, 0, 1]])
             size: Any = numbers[16:]
-            names += given
+            said += given
             lens = Lens("PINHOLE", size, tuple(numbers[12:16]))  # Lens truncates
             yield Frame(image, lens, pose @ OPENGL, said=f"{path.stem}.jpg")
-        self.tell_unused(folder, names)
+        self.tell_unused(folder, said)

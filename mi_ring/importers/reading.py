@@ -36,7 +36,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def orientation_of(path: Path) -> int:
     """The EXIF orientation by which the pixels that we read are to be turned; 1 if there is none."""
-    if path.suffix.lower() in (*image_headers.HEIF, *image_headers.RAW):  # their readers turn them
+    if path.suffix.lower() in (*image_headers.HEIF, *image_headers.RAW):  # turned by the reader; as the sensor has it
         return 1
     value = read_as(path, "image", image_headers.exif_of).get(ExifTags.Base.Orientation)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
@@ -44,13 +44,8 @@ def orientation_of(path: Path) -> int:
 
 def has_alpha(path: Path) -> bool:
     """Does an image file have an alpha channel that is not opaque everywhere?"""
-    suffix = path.suffix.lower()
-    if suffix not in (".exr", *image_headers.TIFF):
-        if suffix in (".jpg", ".jpeg", *image_headers.RAW):
-            return False
-        with reading(path, "image"), image_headers.open_image(existing(path, "image")) as image:
-            if not image.has_transparency_data:
-                return False
+    if not read_as(path, "image", image_headers.has_alpha_channel):
+        return False
     pixels = pixels_of(path)
     full = 1.0 if pixels.dtype == np.float32 else np.iinfo(pixels.dtype).max
     return pixels.shape[2] in (2, 4) and bool((pixels[..., -1] < full).any())

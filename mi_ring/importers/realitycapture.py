@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.fields import Fields
-from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
+from mi_ring.importers.camera_models import Lens, opencv_lens, pose_of
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, list_images, load_lines, load_xml, matrix
@@ -63,16 +63,16 @@ class RealityCapture(Photogrammetry):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
         images = list_images(self.images or (self.src if list_images(self.src) else self.folder))
-        names: dict[str, None] = {}
+        said: dict[str, None] = {}
         for image in images if self.photographs is None else self.photographs:
             path = self.src / f"{image.stem}.xmp"
             fields = xmp_fields(load_xml(path)) if path.is_file() else {}
-            names.update((f"xcr:{name}", None) for name in fields)
+            said.update((f"xcr:{name}", None) for name in fields)
             if "Rotation" in fields and "Position" in fields:
                 yield sidecar_frame(image, fields, str(path))
             else:
                 self.without_pose.add(image.name)
-        self.tell_unused(self.src, names)
+        self.tell_unused(self.src, said)
 
     def from_csv(self) -> Iterator[Frame]:
         """The photographs in the rows of a CSV file."""
@@ -89,11 +89,10 @@ class RealityCapture(Photogrammetry):
             numbers = {name: float(matrix(cells[name], (), f"{what}: {name}")) for name in columns if name in NUMBERS}
             if (image := self.photograph(cells["name"], what)) is None:
                 continue
-            pose = np.eye(4)
             # At zero angles the camera looks down and its top points to y. The heading is clockwise, as on a compass.
             angles = [-numbers["heading"], numbers["pitch"], numbers["roll"]]
-            pose[:3, :3] = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix() @ OPENGL[:3, :3]
-            pose[:3, 3] = [numbers[name] for name in POSE[:3]]
+            R = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
+            pose = pose_of(R, np.array([numbers[name] for name in POSE[:3]])) @ OPENGL
             terms, centre = ([numbers.get(name, 0.0) for name in names] for names in (TERMS, ("px", "py")))
             lens = film_lens(image, numbers["f"], centre, terms, what)
             yield Frame(image, lens, pose, said=cells["name"])
@@ -120,7 +119,7 @@ def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
         length = 3 if count == len(texts) == 3 else 6
         terms[:count] = matrix(texts, (length,), f"{what}: xcr:DistortionCoeficients")[:count]
     lens = film_lens(image, numbers("FocalLength35mm", 1)[0], centre, terms.tolist(), what)
-    return Frame(image, lens, camera_to_world(R, -R @ position), said=image.name)
+    return Frame(image, lens, pose_of(R.T, position), said=image.name)
 
 
 def xmp_fields(root: ElementTree.Element) -> dict[str, str]:

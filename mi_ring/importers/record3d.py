@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.fields import Fields
-from mi_ring.importers.camera_models import Lens
+from mi_ring.importers.camera_models import Lens, pose_of, rotation_of
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import list_images, load_json, matrix, require_object
@@ -54,10 +53,7 @@ class Record3D(Photogrammetry):
         for k, (own, params) in enumerate(zip(poses, lenses)):
             what = f"{path}: poses[{k}]"
             numbers = matrix(own, (7,), what)
-            if abs(np.linalg.norm(numbers[:4]) - 1) > 1e-2:
-                raise InputError(f"{what}: its quaternion is of length {np.linalg.norm(numbers[:4]):.3g}; must be 1")
+            pose = pose_of(rotation_of(numbers[:4], f"{what}: its quaternion"), numbers[4:])
             if image := self.photograph(name := names.get(k, f"{k}.jpg"), what):
-                pose = np.eye(4)
-                pose[:3, :3], pose[:3, 3] = Rotation.from_quat(numbers[:4]).as_matrix(), numbers[4:]
                 yield Frame(image, Lens("PINHOLE", (size[0], size[1]), tuple(params)), pose @ OPENGL, said=name)
         self.tell_unused(path, given)

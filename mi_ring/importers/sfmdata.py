@@ -9,7 +9,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.fields import Fields, json_names
-from mi_ring.importers.camera_models import Lens, camera_to_world, opencv_lens
+from mi_ring.importers.camera_models import Lens, opencv_lens, pose_of
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import load_json, matrix, require_object
@@ -95,10 +95,9 @@ class SfmData(Photogrammetry):
                 self.without_pose.add(PureWindowsPath(file).name)
                 continue
             transform = require_object(place.get("transform"), f"{what}: pose.transform")
-            pose = np.eye(4)
             # The file has the world-to-camera rotation by columns. Read by rows, it is the camera-to-world rotation.
-            pose[:3, :3] = matrix(transform.get("rotation"), (9,), f"{what}: pose.rotation").reshape(3, 3)
-            pose[:3, 3] = matrix(transform.get("center"), (3,), f"{what}: pose.center")
+            R = matrix(transform.get("rotation"), (9,), f"{what}: pose.rotation").reshape(3, 3)
+            pose = pose_of(R, matrix(transform.get("center"), (3,), f"{what}: pose.center"))
             key = str(view.get("intrinsicId"))
             intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
             lens = alicevision_lens(intrinsic, version, f"{self.src}: intrinsic {key!r}")
@@ -128,7 +127,7 @@ class SfmData(Photogrammetry):
             intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
             kind = types.get(type_number(intrinsic["value"], self.src))
             lens = openmvg_lens(pointed_to(intrinsic, what), kind, f"{self.src}: intrinsic {key!r}")
-            yield from self.frame(file, lens, camera_to_world(R, -R @ center), what)
+            yield from self.frame(file, lens, pose_of(R.T, center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
         """Arrange the entries of the list `name` in the file by their field `key`; empty if there is no such list."""

@@ -13,7 +13,7 @@ from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens, opencv_lens, pinhole_lens
 from mi_ring.importers.frames import OPENGL, Frame, Light
 from mi_ring.importers.named_photographs import NamedPhotographs
-from mi_ring.importers.reading import first_file, image_size, images_below, load_json, matrix
+from mi_ring.importers.reading import image_size, images_below, load_json, matrix
 
 
 @dataclass(frozen=True)
@@ -60,19 +60,19 @@ class Transforms(NamedPhotographs):
         },
     )
 
+    names = "transforms.json", "transforms_train.json"
+
     @property
     def folder(self) -> Path:
         return self.images or (self.beside if images_below(self.beside) else super().folder)
 
     def posed(self) -> Iterator[Frame]:
-        path = self.src
-        if path.is_dir():
-            path = first_file([path / "transforms.json", path / "transforms_train.json"], "SRC")
+        path = self.cameras
         top = load_json(path)
         frames = top.get("frames") if isinstance(top, dict) else None
         if not isinstance(frames, list) or not frames:
             raise InputError(f"{path}: frames: found none; must be a list of photographs")
-        names: dict[str, None] = {}
+        said: dict[str, None] = {}
         for number, own in enumerate(frames):
             where = f"frames[{number}]"
             if not isinstance(own, dict):
@@ -86,7 +86,7 @@ class Transforms(NamedPhotographs):
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix")
             if not fields.get("from_na"):  # NeuS2's sign of OpenCV's axes
                 pose = pose @ OPENGL
-            names.update(dict.fromkeys(fields))
+            said.update(dict.fromkeys(fields))
             camera = transforms_camera(fields, image, f"{path}: {where}")
             mask = own.get("mask_path")
             frame = Frame(image, camera, pose, said=name)
@@ -100,7 +100,7 @@ class Transforms(NamedPhotographs):
             if (position := own.get("pl_pos")) is not None:
                 frame.light = Light("point", matrix(position, (3,), f"{path}: {where}.pl_pos"), intensity)
             yield frame
-        self.tell_unused(path, names)
+        self.tell_unused(path, said)
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:

@@ -6,11 +6,10 @@ from math import comb
 
 import numpy as np
 from scipy.interpolate import pade
-from scipy.spatial.transform import Rotation
 
 from mi_ring.errors import InputError
 from mi_ring.fields import Fields
-from mi_ring.importers.camera_models import Lens, camera_to_world
+from mi_ring.importers.camera_models import Lens, pose_of, rotation_of
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.reading import image_size, load_lines, matrix
@@ -53,19 +52,17 @@ class VisualSfm(Photogrammetry):
             name = name.replace('"', " ")
             what = f"{self.src}: camera {name[:99]!r}"
             f, *quaternion, x, y, z, r, _ = matrix(values, (10,), what)
-            if abs(np.linalg.norm(quaternion) - 1) > 1e-2:
-                raise InputError(f"{what}: quaternion: is of length {np.linalg.norm(quaternion):.3g}; must be 1")
+            R = rotation_of(np.roll(quaternion, -1), f"{what}: quaternion")
             if not f:
                 self.without_pose.add(name)
             elif image := self.photograph(name, what, relative=True):
-                R = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
                 size = image_size(image)
                 fx, cx, fy, cy = (f, size[0] / 2, f, size[1] / 2) if K is None else K
                 if not (0.2 < cx / size[0] < 0.8 and 0.2 < cy / size[1] < 0.8):  # some writers count from the middle
                     raise InputError(f"{self.src}: FixedK: the principal point, {cx:g} {cy:g}, is far from the middle "
                                      f"of {image.name}; must be in pixels from its upper left corner")  # fmt: skip
-                yield Frame(image, undistorting_lens(size, (fx, fy, cx, cy), r, what),
-                            camera_to_world(R, -R @ [x, y, z]), said=name)  # fmt: skip
+                lens = undistorting_lens(size, (fx, fy, cx, cy), r, what)
+                yield Frame(image, lens, pose_of(R.T, np.array([x, y, z])), said=name)
 
     def models(self, lines: list[str]) -> list[list[str]]:
         """The lines of the cameras of each model. Each model is a number of cameras, these, and the same of points."""

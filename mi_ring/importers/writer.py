@@ -14,6 +14,7 @@ import scipy.ndimage
 
 from mi_ring.capture.decoding import is_linear
 from mi_ring.errors import InputError
+from mi_ring.image_headers import bits_of
 from mi_ring.images import oriented, write_image
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.reading import image_size, pixels_of
@@ -88,12 +89,10 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
             writer.shared[folder, key] = writer.relative(path)
         return writer.shared[folder, key]
 
-    if pixels is None and (not straight or turn > 1 or encoding == "linear"):
+    if pixels is None and (not straight or turn > 1 or (encoding == "linear" and bits_of(frame.image) == 8)):
         pixels = oriented(pixels_of(frame.image, heed=encoding == "auto"), turn)
         if encoding == "linear" and pixels.dtype == np.uint8:  # the scene file would take 8 bits for sRGB
             pixels = pixels * np.uint16(257)
-        elif straight and turn == 1:
-            pixels = None  # the file can stay
     valid = None
     if not straight:
         assert pixels is not None  # read above

@@ -54,7 +54,6 @@ class Picture:
 
     def stored(self) -> np.ndarray:
         """The pixels as the file stores them, before they are turned upright."""
-
         pixels = read_as(self.path, "photograph", partial(read_image, heed=True))
         if pixels.dtype == np.float32:
             if not np.isfinite(pixels).all():
@@ -116,15 +115,12 @@ class Picture:
     @cached_property
     def encoding(self) -> Encoding:
         """`linear` or `srgb`: the encoding of `pixels`. What the file says counts; otherwise 8 bits are sRGB."""
-        return "srgb" if read_as(self.path, "photograph", encoding_of) == "srgb" else "linear"
+        return read_as(self.path, "photograph", encoding_of)
 
     @cached_property
     def size(self) -> tuple[int, int]:
         """Width and height of `pixels` [px]."""
-        if self.suffix in RAW:
-            size = self.decode(lambda raw: (raw.sizes.iwidth, raw.sizes.iheight))
-        else:
-            size = image_size(self.path)
+        size = image_size(self.path)
         return size[::-1] if self.orientation > 4 else size
 
     def grey(self, longest: int) -> np.ndarray:
