@@ -37,7 +37,8 @@ class ExportConfig(MaterialOptions):
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """File to write. OBJ and XML need further files, which are written beside it."""
     subdivisions: int | None = None
-    """Level of the mesh, with about 10 · 4^level vertices: at most 10 for .ply, 8 for others.
+    """Level of the mesh, which has about 10 · 4^level vertices. The highest level is 10 for .ply, 8 for other files.
+    Lower it for a smaller file, raise it for a finer mesh.
     Without it: the level of the fit, but at most 5 for .glb, whose normal map has the finer detail."""
     resolution: int = RESOLUTION
     """Width and height of the textures [texels], 64 to 4096. More texels keep finer detail and make larger files.

@@ -25,7 +25,10 @@ class Fields:
     harmless: Mapping[str, str] = field(default_factory=dict)  #: not used, because they change nothing
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
-        """Names, kind and meaning or reason of all fields."""
+        """Each entry as (names, kind, text).
+
+        The text is the meaning of a used field, otherwise the reason why it is not used.
+        """
         for kind in KINDS:
             for names, why in getattr(self, kind).items():
                 yield names, kind, why

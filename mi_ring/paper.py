@@ -54,7 +54,8 @@ class PaperConfig:
     seeds: tuple[int, ...] = (0,)
     """Random seeds. Each run is made once with each seed, and the table has the means. More seeds give surer means."""
     only: tuple[str, ...] = ()
-    """Names of the runs to make now, to spread an experiment over several times or machines. Without it: all."""
+    """Names of the runs to make now, to spread an experiment over several times or machines.
+    A wrong name makes the command list all names. Without it: all runs."""
     quick: bool = False
     """Make a small version in minutes: few runs, few iterations, small photographs.
     Its results are in OUT/NAME-quick."""

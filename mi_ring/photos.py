@@ -67,7 +67,8 @@ class PhotosConfig:
     Without a sheet the unit is the median distance from the cameras to the object.
     Measure it while the camera is held as in most photographs. For the others the command turns it with the camera."""
     turntable: bool = False
-    """Set it if the object turned, with the sheet under it, while camera and flash stood still."""
+    """Set it if the object turned on a turntable while camera and flash stood still.
+    It needs the printed sheet of `mi-ring board` under the object, turning with it."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
     """Where the masks of the object come from. Give another source if the masks of auto are wrong.
     auto: found from the photographs and their 3-D points. alpha: the alpha channels of the photographs.

@@ -68,7 +68,11 @@ class Unknown(ABC):
         return self.width
 
     def rows(self, rig: Rig, index: np.ndarray) -> list[np.ndarray]:
-        """The rows of the parameter on which photographs `index` (n,) depend: arrays (n,), one for each such row."""
+        """Which rows of the parameter each of the photographs `index` (n,) depends on.
+
+        Each array (n,) holds one row number per photograph. There is one array, or one for each lamp, because all lamps
+        light every photograph.
+        """
         if self.per == "lamp":  # all lamps light all photographs
             return [np.full_like(index, k) for k in range(rig.count("lamp"))]
         numbers = {"lens": rig.lens, "light": rig.place}

@@ -187,7 +187,10 @@ def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[in
 
 
 def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
-    """Decode a photograph and reduce it to a window, by strips: float16 for 8 bits, else float32."""
+    """Decode a photograph to linear radiance, cut the window out and scale it down to the window's size.
+
+    It works in strips, to save memory. Returns float16 for a photograph of 8 bits, otherwise float32.
+    """
     image = read()
     radiance, clipped = [], []
     blocks, (left, top), (width, height) = window.blocks, window.corner, window.extent

@@ -99,7 +99,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Experiment:
-    """The description of a table and a figure."""
+    """An experiment of the paper: which fits to run, and how a table and a figure show their results."""
 
     about: str  #: one sentence
     list_runs: Callable[[ExperimentOptions], list[Run]]  #: without seeds, unless a run sets its own

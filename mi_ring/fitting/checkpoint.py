@@ -72,7 +72,10 @@ def require_same_files(state: dict, capture: Capture, config: Config, folder: Pa
 
 
 def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
-    """Make the fit of a checkpoint. Raises InputError if it holds none, or if its files have changed."""
+    """Restore the fit from the `state` of a checkpoint, to continue it. `folder`: of the results, named in errors.
+
+    Raises InputError if the state holds no usable fit, or if a file of the capture has changed since.
+    """
     require_same_files(state, capture, config, folder)
     try:
         fit = Fit(capture, config, state=state["fit"])

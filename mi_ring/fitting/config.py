@@ -148,7 +148,7 @@ class Ablation:
     Without shadows a fit is faster, but the surface is wrong, unless each light is at its camera."""
     indirect: bool = True
     """Predict light that the object reflects onto itself (interreflection), which matters in concave parts.
-    Leave it out if the intensities of the lights are wrong."""
+    Give --no-indirect if the scene file has wrong intensities of the lights."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
     """How the difference of predicted and observed colours is measured.
     l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.

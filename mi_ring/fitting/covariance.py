@@ -121,7 +121,10 @@ class CovarianceGroup:
         return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict radiance (n, H, W, 3) by interreflection and by the room's light, to add to direct light `lit`."""
+        """Predict the radiance that is added to direct light: that of interreflection and that of the room's light.
+
+        Each is (n, H, W, 3), or zero if it is not used. `lit`, `coverage`: from `direct`.
+        """
         calibration, indirect = self.calibration, self.indirect
         bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
         room = calibration.room_harmonics()

@@ -45,9 +45,10 @@ class RegulariserStrength:
             self.unexplained += RECENT * (unexplained - self.unexplained)
 
     def strength(self, decay: float) -> float:
-        """A factor of the regulariser's weight, which falls to `decay`. It is 1 while much light is unexplained.
+        """Factor for the regulariser's weight: it falls from 1 at the start to `decay` at the end of the fit.
 
-        With wrong lights, or in a room that is not dark, a weak regulariser would let the surface fold.
+        It stays 1 while the model leaves much light unexplained: with wrong lights, or in a room that is not dark, a
+        weak regulariser would let the surface fold. It exceeds 1 while the surface intersects itself.
         """
         return max(decay**self.weakened, min(1.0, (self.unexplained / UNEXPLAINED) ** 4))
 

@@ -83,7 +83,10 @@ class NamedPhotographs(Source):
         return best
 
     def mask_at(self, path: str, what: str) -> Path:
-        """The mask at a path that the file says. Raises InputError, which begins with `what`, if there is none."""
+        """Find the mask for a path in the imported file: beside SRC, otherwise by its name in the folder --masks.
+
+        Raises InputError if there is none; `what` begins the message.
+        """
         if is_file(file := self.beside / path):
             return file
         folder = self.masks or self.beside

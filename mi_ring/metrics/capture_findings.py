@@ -137,8 +137,9 @@ def facing(capture: Capture, center: np.ndarray) -> str | None:
 def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
     """Lower bound of the share of room light in the light on the object; 0 if none is found.
 
-    `brightness` (n,): as in `PhotographQuality`. `received` (n,): irradiance. Room light does not depend on the
-    distance of the flash, so the object looks too bright where the irradiance is small.
+    `brightness` (n,): of the object in each photograph, as in `PhotographQuality`. `received` (n,): irradiance of the
+    object by the known lights. Room light does not depend on the distance of the flash, so the object looks too bright
+    where the irradiance is small.
     """
     if len(received) < 12 or received.max() < 1.5 * received.min():
         return 0.0

@@ -28,7 +28,8 @@ class MaterialOptions:
     specular_scale: float = 1.0
     """Factor for the specular reflectance: above 1 for stronger highlights, 0 for none."""
     roughness_add: float = 0.0
-    """Number to add to the roughness, which stays in its range. Above 0: wider highlights. Below 0: sharper ones."""
+    """Number to add to the roughness, for example 0.1 or -0.1. Above 0: wider highlights. Below 0: sharper ones.
+    The sum is clipped to the range of the material, at most 0 to 1."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors for red, green and blue of the object's colour, 0 or more. 1 1 1: no change."""
 

@@ -33,8 +33,8 @@ class SynthesizeConfig:
     """Folder to write."""
 
     material: str | None = None
-    """Material of the object.
-    Without it: principled, with the colours in the mesh's file, or one colour if it has none."""
+    """Material of the object, for example "principled base_color=0.6,0.2,0.1 roughness=0.3". All forms: see above.
+    Without it: principled, with the colours of the mesh file, or with one colour if the file has none."""
     second: str | None = None
     """Second material, in the places that --pattern says. Without it: the object has one material."""
     pattern: Annotated[str, arg(metavar="stripes|checks|PICTURE")] = "stripes"
@@ -118,7 +118,8 @@ class SynthesizeConfig:
     """Error of the positions of point lights in the scene file [% of the camera's distance]. 0: exact positions.
     All lights have the same error, in the axes of their cameras."""
     wrong_power: float = 0.0
-    """Standard deviation of errors of each light's power in the scene file [%]. 0: exact powers."""
+    """Random error of the power of each light in the scene file, to test --refine power: its standard deviation [%].
+    0: exact powers."""
     wrong_exposure: float = 0.0
     """Standard deviation of the photographs' exposures, which the scene file does not say [%]. 0: equal exposures.
     The white balance varies by a third of this number."""
