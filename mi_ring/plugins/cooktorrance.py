@@ -227,10 +227,10 @@ def cosine_factors(order):
 def gloss_table(variant, distribution, order):
     """Tabulate the specular lobe for a specular reflectance of 1: a texture over roughness and n·o.
 
-    Roughness is from 0.02 to 1. n·o is from 0 to 1: n is the normal, o the direction to the viewer. Channels 0 and 1 give
-    the mean direction of the lobe. 0: its component along the surface, opposite to o, divided by that of o. 1: its
-    component along n. Channel 2 + l: the integral of the lobe times the Legendre polynomial of degree l about the mean
-    direction. The integrals are averages over a grid of visible normals, as in `CookTorrance.sample`.
+    Roughness is 0.02 to 1, n·o 0 to 1: n is the normal, o the direction to the viewer. Channels 0 and 1 give the mean
+    direction of the lobe. 0: its component along the surface, opposite to o, divided by that of o. 1: its component
+    along n. Channel 2 + l: the integral of the lobe times the Legendre polynomial of degree l about the mean direction.
+    The integrals are averages over a grid of visible normals, as in `CookTorrance.sample`.
     """
     with dr.suspend_grad():
         count = GLOSS_SAMPLES**2
