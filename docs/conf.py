@@ -23,13 +23,11 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import find_pending_xref_condition, make_refnode
 
 import mi_ring
-from mi_ring import image_fields
+from mi_ring import image_fields, image_headers
 from mi_ring.__main__ import COMMANDS, summary
-from mi_ring.importers import reading
 from mi_ring.importers.formats import FORMATS
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.transforms import Transforms
-from mi_ring.photogrammetry import folder
 
 project, author = "mi_ring", "the authors of mi_ring"
 extensions = ["sphinx.ext.autodoc", "myst_parser", "sphinx_design"]
@@ -102,18 +100,12 @@ class Commands(SphinxDirective):
 
 
 class Formats(SphinxDirective):
-    """`.. formats::`: which commands read which image files, and the cameras of which tools."""
+    """`.. formats::`: which image files are read, and the cameras of which tools."""
 
     def run(self) -> list[nodes.Node]:
-        self.env.note_dependency(inspect.getsourcefile(image_fields))
-        readers = {
-            "photos": folder.SUFFIXES, "convert": reading.image_headers.SUFFIXES, "check, fit, render, evaluate":
-            reading.image_headers.SUFFIXES, "masks": reading.image_headers.SUFFIXES,
-        }  # fmt: skip
-        rows = [["image files", "suffixes", *readers]]
-        for kind, suffixes in image_fields.KINDS.items():
-            marks = ["yes" if {*suffixes} <= {*own} else "no" for own in readers.values()]
-            rows.append([kind, names(suffixes), *marks])
+        self.env.note_dependency(inspect.getsourcefile(image_headers))
+        rows = [["image files", "suffixes"]]
+        rows += [[kind, names(suffixes)] for kind, suffixes in image_headers.BY_KIND.items()]
         options = {"``--images``": "images", "``--masks``": "masks", "``--flash-offset``": "flash_offset"}
         cameras = [["cameras", "``convert``", "``photos`` finds them beside photographs", *options]]
         for name, source in FORMATS.items():

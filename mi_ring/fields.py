@@ -33,9 +33,9 @@ class Fields:
             for names, why in getattr(self, kind).items():
                 yield names, kind, why
 
-    def names(self, *kinds: str) -> list[str]:
-        """The names of the fields of these kinds; of all kinds if none is given."""
-        return [name for names, kind, _ in self.rows() if not kinds or kind in kinds for name in names.split()]
+    def names(self) -> list[str]:
+        """The names of all fields."""
+        return [name for names, _, _ in self.rows() for name in names.split()]
 
     @cached_property
     def patterns(self) -> list[tuple[re.Pattern[str], str, str]]:

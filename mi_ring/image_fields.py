@@ -5,15 +5,10 @@ from pathlib import Path
 import tifffile
 
 from mi_ring.fields import Fields
-from mi_ring.image_headers import HEIF, RAW, TIFF, exr_attributes, exr_channels, exr_picture, open_image, png_chunks
+from mi_ring.image_headers import RAW, TIFF, exr_attributes, exr_channels, exr_picture, open_image, png_chunks
 
 ANIMATED = "further pictures; the first is read"
 TIFF_COLOURS = "WhitePoint PrimaryChromaticities TransferFunction"
-#: Suffixes of image files by their kind, for the documentation.
-KINDS = {
-    "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "TIFF": TIFF, "WebP": (".webp",), "AVIF": (".avif",),
-    "BMP": (".bmp",), "HEIF": HEIF, "OpenEXR": (".exr",), "raw": RAW,
-}  # fmt: skip
 #: By kind of file.
 FIELDS = {
     "PNG": Fields(

@@ -27,11 +27,14 @@ from mi_ring.colour_profiles import (
 from mi_ring.foreign import require_plausible_size
 from mi_ring.system.optional import need
 
-#: Suffixes of image files that are read, in lower case: common formats, formats whose package may be missing, others.
-PLAIN, HEIF = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp"), (".heic", ".heif")
+TIFF, HEIF = (".tif", ".tiff"), (".heic", ".heif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
-SUFFIXES = (*PLAIN, *HEIF, *RAW, ".exr")
-TIFF = (".tif", ".tiff")
+#: Suffixes of image files that are read, in lower case, by their kind.
+BY_KIND = {
+    "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "TIFF": TIFF, "WebP": (".webp",), "AVIF": (".avif",),
+    "BMP": (".bmp",), "HEIF": HEIF, "OpenEXR": (".exr",), "raw": RAW,
+}  # fmt: skip
+SUFFIXES = tuple(itertools.chain(*BY_KIND.values()))
 KINDS = "JPEG, PNG, TIFF, OpenEXR, WebP, AVIF, HEIC, BMP or raw"  #: for messages
 FORMATS = "JPEG", "MPO", "PNG", "WEBP", "HEIF", "AVIF", "BMP", "TIFF"  #: formats in which Pillow may open a file
 PNG_DEPTH = 24  #: where a PNG file says the number of its bits

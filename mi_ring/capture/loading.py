@@ -17,7 +17,7 @@ from mi_ring.capture.decoding import read_mask, read_photograph, require_header
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.capture.reduction import reduced
 from mi_ring.errors import InputError, SceneError, require_file
-from mi_ring.image_headers import HEIF, PLAIN, RAW
+from mi_ring.image_headers import SUFFIXES
 from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.spherical_harmonics import room_of
@@ -112,7 +112,7 @@ def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
 
 def require_scene(path: Path) -> None:
     """Raise InputError if a path is not a scene file, but a photograph or no file. The message says what to give."""
-    photographs = path.is_dir() or path.suffix.lower() in PLAIN + HEIF + RAW
+    photographs = path.is_dir() or path.suffix.lower() in SUFFIXES
     usual = "the XML file of a scene" + ("; mi-ring photos makes one of a folder of photographs" * photographs)
     inside = path / "scene.xml"
     require_file(path, str(inside) if inside.is_file() else usual)

@@ -35,8 +35,8 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def orientation_of(path: Path) -> int:
-    """The EXIF orientation by which the pixels that we read are to be turned; 1 if there is none."""
-    if path.suffix.lower() in (*image_headers.HEIF, *image_headers.RAW):  # turned by the reader; as the sensor has it
+    """The EXIF orientation by which the pixels that we read are to be turned; 1 if there is none, and for raw files."""
+    if path.suffix.lower() in (*image_headers.HEIF, *image_headers.RAW):  # HEIF's reader has turned them already
         return 1
     value = read_as(path, "image", image_headers.exif_of).get(ExifTags.Base.Orientation)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
