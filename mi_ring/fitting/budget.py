@@ -80,6 +80,6 @@ def seconds_of(config: Config, plan: Planner, costs: Costs) -> float:
 
 
 def seconds_around(config: Config, plan: Planner, costs: Costs) -> float:
-    """Estimate the time [s] that a fit needs besides its iterations: for the pictures before them and for the results."""
+    """Estimate the time [s] of a fit outside its iterations: for the pictures before them and for the results."""
     last = plan(config).stages[-1]
     return AROUND * costs[last.level, last.width]

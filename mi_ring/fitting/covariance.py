@@ -77,7 +77,7 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
 
 class Equations:
-    """The normal equations of least squares, to which photographs are added one by one, and the variance of the residuals."""
+    """Normal equations of least squares, to which photographs are added one by one, and the residuals' variance."""
 
     def __init__(self, count: int) -> None:
         self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
@@ -98,7 +98,7 @@ class Equations:
         self.pixels += channels * int(counted.sum())
 
     def information(self) -> np.ndarray:
-        """Compute the Fisher information matrix (N, N) of the photographs added so far: the inverse of the covariance."""
+        """Compute the Fisher information matrix (N, N) of the added photographs: the inverse of the covariance."""
         return self.matrix * (self.pixels / self.squares if self.squares else 0.0)
 
 

@@ -32,7 +32,7 @@ class ExposureSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def look(self, it: Iteration) -> None:
-        """Measure how much brighter each photograph is than its prediction: the median log ratio in each colour channel.
+        """Measure how much brighter each photograph is than predicted: the median log ratio in each colour channel.
 
         Only bright pixels on the object count. The mean over photographs is subtracted, because the albedo explains it.
         """

@@ -135,7 +135,7 @@ class Fit(Renamed):
         return self.loss(it), it
 
     def context(self) -> Context:
-        """What the terms of the loss and the solvers may read at the current iteration, besides its batch and prediction."""
+        """Collect what terms of the loss and solvers may read at this iteration, besides batch and prediction."""
         config, one_material = self.problem.config, self.problem.lighting.one_material_until > 0
         return Context(config, self.capture, self.model, self.schedule, self.problem.exposure, one_material,
                        self.regulariser.strength(config.velocity_decay), self.renderer.autocast)  # fmt: skip

@@ -63,11 +63,14 @@ class Iteration(renamed.Renamed):
         return self.batch.stage
 
     def object_pixels(self) -> Tensor:
-        """Find pixels (n, H, W) bool that show only the object, according to the prediction and, if there is one, the mask."""
+        """Find pixels (n, H, W) bool that show only the object, by the prediction and, if there is one, the mask."""
         return self.observation.surely(self.prediction.coverage.detach())
 
     def counted(self) -> Tensor | None:
-        """The pixels (n, H, W) bool that the colour loss uses: in a lit room those of the object; else None, which means all."""
+        """Pixels (n, H, W) bool that the colour loss compares. None: all pixels.
+
+        In a lit room they are the object's pixels, because the background is bright there.
+        """
         return self.object_pixels() if self.context.capture.lit_room else None
 
     def outline_blur(self) -> float:
@@ -76,7 +79,7 @@ class Iteration(renamed.Renamed):
 
     @torch.no_grad()
     def unexplained(self) -> float:
-        """Sum of absolute errors over the object's pixels, divided by the sum of observed radiance there; NaN if that is 0."""
+        """Sum of absolute errors on the object, divided by the sum of observed radiance there; NaN if that is 0."""
         pixels = self.object_pixels()
         error = (self.prediction.rgb - self.observation.rgb)[pixels]
         error = torch.where(self.observation.clipped[pixels], error.clamp(max=0), error)

@@ -167,9 +167,9 @@ class CoarseFits:
         return Lighting("lamps", lamps, distant)
 
     def with_material(self, lighting: Lighting) -> Lighting:
-        """Return the lighting with a uniform material at the start of the fit, if that explains the photographs about as well.
+        """Start with a uniform material under this lighting, if that explains the photographs about as well.
 
-        Otherwise returns `lighting` unchanged.
+        Returns the better one of the two lightings, with the lamps that the coarse fit has estimated.
         """
         one = lighting._replace(one_material_until=1.0)
         if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):

@@ -53,7 +53,7 @@ class Lighting(NamedTuple):
         return kind + " on one material" * (self.one_material_until > 0)
 
     def material_at(self, progress: float, material: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Constrain the `material` (V, …) of the vertices: until progress `one_material_until`, each gets the mean of all.
+        """Return the material (V, …) to render at this progress: before `one_material_until` the mean of all vertices.
 
         Photographs hardly distinguish slow changes of albedo from slow changes of light. So the light explains both.
         """
@@ -148,11 +148,11 @@ def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
 
 
 def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
-    """Convert the scene's environment map to spherical harmonics of the room, whose reflection is computed without noise.
+    """Convert the scene's environment map to spherical harmonics of the room, whose reflection has no noise.
 
-    Returns (capture with that room, scene without the environment, harmonics (BASIS, 3)). Without an environment map,
-    with an unmasked photograph (its background shows the environment), or with a BSDF other than `cooktorrance` it
-    returns the capture and its scene unchanged, and None.
+    Returns (capture with that room, scene without the environment, its harmonics (BASIS, 3)). Without an environment
+    map, it returns the capture and its scene as they are, and None. So it does if a photograph has no mask, because its
+    background shows the environment, and for BSDFs other than `cooktorrance`.
     """
     if not all(capture.masks.given) or not hasattr(capture.shape.bsdf(), "lobes"):
         return capture, capture.scene, None
