@@ -161,7 +161,7 @@ def mask_values(pixels: np.ndarray) -> np.ndarray:
 
 
 def orientation_axes(orientation: int) -> np.ndarray:
-    """Rotation (3, 3) from the axes of stored pixels (x right, y down, z forward) to those after an EXIF orientation."""
+    """Matrix (3, 3) from the axes of stored pixels (x right, y down, z forward) to those after an EXIF orientation."""
     column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
     return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
 

@@ -71,7 +71,7 @@ def require_most(source: Source, frames: Sequence[Frame]) -> None:
 
 
 def unread(source: Source) -> str:
-    """Write a clause for the user if cameras lack a photograph only because we do not read its file format; else empty."""
+    """Name, in a clause for the user, unsupported file formats of the missing photographs; empty if there are none."""
     stems = {stem_of(parts_of(name)[-1]) for name in source.without_photograph if parts_of(name)}
     found = (file for file in source.folder.rglob("[!.]*") if stem_of(file.name.lower()) in stems)
     kinds = {file.suffix.lower() for file in found if file.is_file()} & UNREAD

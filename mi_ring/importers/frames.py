@@ -121,7 +121,7 @@ def frames_of(source: Source) -> list[Frame]:
 
 
 def is_scaled(size: Sequence[int], original: Sequence[int]) -> bool:
-    """Test whether `size` is `original` resized by at least 5 %, with the same proportions; both (width, height) [px]."""
+    """Test whether `size` is `original` resized by at least 5 %, with equal proportions; both (width, height) [px]."""
     factor = max(size) / max(original)
     return abs(factor - 1) > 0.05 and all(abs(a - factor * b) <= 1 for a, b in zip(size, original))
 
@@ -151,7 +151,7 @@ def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
-    """Raise InputError if there are no frames, if an image and its camera differ in size, or if `require_cameras` does."""
+    """Raise InputError if there are no frames, if an image and its camera differ in size, or like `require_cameras`."""
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")
     require_cameras(frames)

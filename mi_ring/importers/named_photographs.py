@@ -51,7 +51,7 @@ class NamedPhotographs(Source):
 
     @cached_property
     def photograph_files(self) -> PhotographFiles:
-        """Index of the files that may be photographs: those in `photographs` if it is given, otherwise all in `folder`."""
+        """Index of the files that may be photographs: those in `photographs` if given, otherwise all in `folder`."""
         if self.photographs is not None:
             return PhotographFiles(self.photographs, self.photographs[0].parent if self.photographs else Path())
         return PhotographFiles(images_below(self.folder), self.folder)
@@ -89,7 +89,7 @@ class NamedPhotographs(Source):
         return best
 
     def mask_at(self, path: str, what: str) -> Path:
-        """Find the mask for its `path` in the camera file: relative to that file, otherwise by name in the folder --masks.
+        """Find the mask for a `path` in the camera file: relative to that file, else by name in the folder --masks.
 
         Raises InputError if there is none; `what` begins the message.
         """
@@ -113,9 +113,9 @@ class NamedPhotographs(Source):
         yield from frames
 
     def find_masks(self, frames: list[Frame]) -> None:
-        """Set the mask of each frame: from the folder `masks`, else from alpha channels, else from a folder of masks nearby.
+        """Set the mask of each frame: from the folder `masks`, else from alpha channels, else from a masks folder nearby.
 
-        Raises InputError if `masks` lacks the mask of a photograph.
+        Raises InputError if the folder `masks` lacks the mask of a photograph.
         """
         folder, root = self.masks, self.photograph_files.root
         if folder is not None and not folder.is_dir():

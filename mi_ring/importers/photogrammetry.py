@@ -37,7 +37,7 @@ class Photogrammetry(NamedPhotographs):
             yield frame
 
     def exposures(self, frames: Sequence[Frame]) -> np.ndarray:
-        """Relative exposures (N,) of the frames, by EXIF data, divided by their median; all 1 if no photograph has EXIF data.
+        """Relative exposures (N,) of the frames by EXIF data, divided by their median; 1 for all if EXIF has none.
 
         Raises InputError if only some photographs have an exposure.
         """
