@@ -192,7 +192,7 @@ class Capture:
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Split the photographs `index` into groups to render in one launch: of one size, at most `most` photographs each."""
+        """Split the photographs `index` into groups of one size, at most `most` each, to render in one launch."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
@@ -247,7 +247,7 @@ class Capture:
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
         """Estimate the reflectance of a surface at `center` (3,) whose mean radiance in the photographs is `exposure`.
 
-        Without lights of the photographs themselves, it is `ALBEDO`'s.
+        It is ALBEDO / π if no known light reaches the surface.
         """
         received = float(np.median(self.photographs.irradiance(center).mean(1)))
         return exposure / received if received > 0 else ALBEDO / math.pi
@@ -310,7 +310,10 @@ class Capture:
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
-        """Return (centre (3,), radius) of the normalising sphere [scene units]: from the XML, else from masks or cameras."""
+        """Return (centre (3,), radius) of the normalising sphere [scene units].
+
+        They are given in the XML or estimated.
+        """
         center, radius = self.shape.center, self.shape.radius
         if center is None or radius is None:
             if self.hull:

@@ -49,7 +49,7 @@ def decode(
 
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
-    """Vignetting times gain of a photograph at 1 / `scale` of its size: (H, W, 3), or (3,) without vignetting, or 1.0."""
+    """Vignetting times gain at 1 / `scale` of the photograph's size: (H, W, 3), (3,) without vignetting, or 1.0."""
     gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
     if not shot.response.vignetting:
         return gain
@@ -58,7 +58,7 @@ def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
 
 
 def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
-    """Convert radiance (H, W, 3) to the linear values that the photograph's camera records, at 1 / `scale` of its size."""
+    """Convert radiance (H, W, 3) to the linear values that the camera records, at 1 / `scale` of the shot's size."""
     curved = (radiance * shade(shot, scale)) ** shot.response.gamma
     return curved if shot.response.contrast == 1 else contrasted(curved, shot.response.contrast)
 

@@ -69,7 +69,10 @@ def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, c
 
 
 def reduction_factor(size: tuple[int, ...], width: int) -> float:
-    """Factor by which an image of `size` (width, height) [px] must be reduced to be at most `width` [px] wide; at least 1."""
+    """Factor, at least 1, by which an image must shrink to be at most `width` [px] wide.
+
+    `size`: (width, height) [px].
+    """
     return max(1.0, size[0] / width, size[1] / (HIGHEST * width))
 
 

@@ -72,7 +72,10 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:
-    """Network output for which BRDF-Net predicts the mean of `value`, in the range from `low` to `high`; 0 if that is infinite."""
+    """Network output for which BRDF-Net predicts the mean of `value` in the range from `low` to `high`.
+
+    It is 0 if `high` is infinite.
+    """
     if math.isinf(high):
         return 0.0
     share = (float(value.mean()) - low) / (high - low)

@@ -113,7 +113,7 @@ class NamedPhotographs(Source):
         yield from frames
 
     def find_masks(self, frames: list[Frame]) -> None:
-        """Set the mask of each frame: from the folder `masks`, else from alpha channels, else from a masks folder nearby.
+        """Set the mask of each frame: from the folder `masks`, else from alpha channels or a masks folder nearby.
 
         Raises InputError if the folder `masks` lacks the mask of a photograph.
         """
