@@ -12,19 +12,19 @@ RELATIVE = 1  #: rendering intent: relative colorimetric
 
 
 class Statement(NamedTuple):
-    """What a file says about its colours. Without either, 8 bits are sRGB, and all others are linear."""
+    """The colour space that a file declares. If it declares none, 8-bit pixels are sRGB and all others are linear."""
 
     profile: bytes | None = None  #: an ICC profile
     exponent: float | None = None  #: linear = encoded ^ exponent; 2.2 stands for sRGB's curve
 
 
 def srgb_to_linear(v: np.ndarray) -> np.ndarray:
-    """Convert sRGB values to linear ones (IEC 61966-2-1), as float32."""
+    """Decode sRGB values to linear ones (IEC 61966-2-1), float32."""
     return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def primaries_profile(white: tuple, primaries: tuple, exponent: float = 1.0) -> bytes:
-    """The profile of RGB with this white (x, y) and these primaries (x, y of red, green and blue).
+    """Make the ICC profile of an RGB space: `white` (x, y), and `primaries` (x, y of red, green and blue).
 
     linear = encoded ^ `exponent`; 2.2 stands for sRGB's curve.
     """
@@ -47,7 +47,10 @@ CURVES = {1: 2.2, 2: 2.2, 4: 2.2, 5: 2.8, 6: 2.2, 8: 1.0, 13: 2.2, 14: 2.2, 15: 
 
 
 def coded_statement(primaries: int, curve: int) -> Statement:
-    """What the codes of ITU-T H.273 say, in PNG, HEIF and AVIF. Raises ValueError for those of HDR and of others."""
+    """Convert ITU-T H.273 codes, as in PNG, HEIF and AVIF, to a colour space.
+
+    Raises ValueError for HDR and unknown codes.
+    """
     if curve not in CURVES or primaries not in CODED:
         what = {16: "PQ, of HDR", 18: "HLG, of HDR"}.get(curve, f"{primaries}/{curve} by ITU-T H.273")
         raise ValueError(f"its colours are {what}; save it as sRGB")
@@ -58,16 +61,16 @@ def coded_statement(primaries: int, curve: int) -> Statement:
 
 @lru_cache(maxsize=8)
 def is_usual(profile: bytes, linear: bool) -> bool:
-    """Is a profile that of sRGB, or with `linear` that of linear radiance with sRGB's primaries?"""
+    """Test whether an ICC profile is that of sRGB or, with `linear`, of linear light with sRGB's primaries."""
     axis = np.linspace(0, 1, 6, dtype=np.float32)
     colours = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(36, 6, 3)
     return bool(np.abs(transformed(colours, profile) - (colours if linear else srgb_to_linear(colours))).max() < 2e-3)
 
 
 def transformed(colours: np.ndarray, profile: bytes) -> np.ndarray:
-    """Linear radiance, sRGB's primaries, of encoded colours (H, W, 1 or 3): uint16 for integers, otherwise float32.
+    """Convert encoded colours (H, W, 1 or 3) to linear radiance with sRGB's primaries, by an ICC profile.
 
-    Raises ValueError if the profile is damaged, or neither of RGB nor of grey.
+    Integers become uint16, all else float32. Raises ValueError if the profile is damaged, or neither RGB nor grey.
     """
     if (space := SPACES.get(profile[16:20])) is None:
         raise ValueError(f"its colour profile is of {profile[16:20].decode('ascii', 'replace').strip()}, not of RGB or "
@@ -90,10 +93,11 @@ def transformed(colours: np.ndarray, profile: bytes) -> np.ndarray:
 
 
 def as_stated(pixels: np.ndarray, said: Statement) -> np.ndarray:
-    """Pixels (H, W, C) of a file, of which 8 bits are sRGB, and all others linear radiance with sRGB's primaries.
+    """Convert pixels (H, W, C) from the colour space that their file declares to the usual one.
 
-    Those that are stored so are returned as they are. Others become linear: uint16 if they were integers, otherwise
-    float32. A clipped pixel remains clipped. Raises ValueError as `transformed` does.
+    Usual are sRGB for 8 bits, and linear radiance with sRGB's primaries for all others. Such pixels are returned as
+    they are. Others become linear: uint16 if they were integers, otherwise float32. Clipped pixels remain clipped.
+    Raises ValueError as `transformed` does.
     """
     kind = pixels.dtype
     count = 3 if pixels.shape[2] > 2 else 1

@@ -94,7 +94,10 @@ FIELDS = {
 
 
 def field_names(path: Path) -> tuple[str, list[str]]:
-    """The kind of an image file, a key of `FIELDS`, and the names of its fields. Raises the errors of `open_image`."""
+    """Return (file kind, a key of `FIELDS`; names of the metadata fields) of an image file.
+
+    Raises as `open_image` does.
+    """
     suffix = path.suffix.lower()
     if suffix == ".exr":
         attributes = dict(exr_attributes(path))
@@ -116,7 +119,7 @@ def field_names(path: Path) -> tuple[str, list[str]]:
 
 
 def unused_fields(path: Path) -> dict[str, str]:
-    """The fields of an image file that are neither used nor harmless, with the reason or "unknown"."""
+    """Find metadata fields of an image file that are not used but may matter: reason, or "unknown", by name."""
     kind, names = field_names(path)
     found = FIELDS[kind].unused(names)
     if kind == "TIFF" and "InterColorProfile" in names:

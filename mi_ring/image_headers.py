@@ -46,7 +46,7 @@ Image.MAX_IMAGE_PIXELS = None
 
 
 class BoundedFile(io.BufferedReader):
-    """A file whose `read` allocates at most the bytes that are left, even if a damaged header requests more."""
+    """A file whose `read` never allocates more than the remaining bytes, even if a damaged header requests more."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         left = max(0, os.fstat(self.fileno()).st_size - self.tell())
@@ -55,10 +55,10 @@ class BoundedFile(io.BufferedReader):
 
 @contextlib.contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image file by Pillow, in a context manager.
+    """Context manager that opens an image file with Pillow.
 
-    Raises ValueError if it is no image or declares an implausible size, InputError if it is HEIF and pillow_heif is not
-    installed, and other errors if it is damaged.
+    Raises ValueError if it is no image or declares an implausible size, InputError for HEIF if pillow_heif is not
+    installed, and other errors if the file is damaged.
     """
     if path.suffix.lower() in HEIF:
         need("pillow_heif", f"{path}").register_heif_opener()
@@ -76,7 +76,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def exif_of(path: Path) -> Image.Exif:
-    """The EXIF data of an image file; empty if it has none. Raises the same errors as `open_image`."""
+    """Read the EXIF data of an image file; empty if it has none. Raises as `open_image` does."""
     suffix, exif = path.suffix.lower(), Image.Exif()
     if suffix in (*TIFF, *RAW):  # Pillow does not open all of their pixels
         trouble = () if suffix in TIFF else (Exception,)  # of raw files that are no TIFFs
@@ -92,7 +92,7 @@ def exif_of(path: Path) -> Image.Exif:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Read the width and height [px] that an image file declares. Raises the same errors as `open_image`."""
+    """Read (width, height) [px] from the header of an image file. Raises as `open_image` does."""
     suffix = path.suffix.lower()
     if suffix == ".exr":
         return exr_size(path)[:2]
@@ -107,7 +107,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def has_alpha_channel(path: Path) -> bool:
-    """Has an image file an alpha channel? Raises the same errors as `open_image`."""
+    """Test whether an image file has an alpha channel. Raises as `open_image` does."""
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg", *RAW):
         return False
@@ -122,9 +122,10 @@ def has_alpha_channel(path: Path) -> bool:
 
 
 def statement_of(path: Path) -> Statement:
-    """What an image file says about its colours. Raises the same errors as `open_image`.
+    """Read the colour space that an image file declares. Raises as `open_image` does.
 
-    The first of these counts: codes of PNG (cICP), a profile, codes of HEIF and AVIF, chunks of PNG, Adobe RGB by EXIF.
+    If there are several declarations, the first of these counts: PNG's cICP chunk, ICC profile, HEIF and AVIF codes,
+    other PNG chunks, Adobe RGB in EXIF.
     """
     suffix = path.suffix.lower()
     if suffix == ".exr":
@@ -155,7 +156,7 @@ def statement_of(path: Path) -> Statement:
 
 
 def png_statement(info: dict, bits: int) -> Statement:
-    """What the chunks sRGB, gAMA and cHRM of a PNG file say. `info`: as Pillow reads them."""
+    """Read the colour space from the PNG chunks sRGB, gAMA and cHRM. `info`: metadata as Pillow reads it."""
     if "srgb" in info:
         return Statement(None, 2.2)
     gamma, places = info.get("gamma"), info.get("chromaticity")
@@ -167,7 +168,7 @@ def png_statement(info: dict, bits: int) -> Statement:
 
 
 def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Name and content of the chunks of a PNG file before its pixels; longer ones are cut off after 64 bytes."""
+    """Yield (name, content) of each chunk before the pixels of a PNG file. Content is cut off after 64 bytes."""
     with path.open("rb") as file:
         file.seek(8)
         while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
@@ -177,7 +178,7 @@ def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
 
 
 def bits_of(path: Path) -> int:
-    """Bits of a channel that an image file stores: 8, 16, or 32 for floats. Raises the same errors as `open_image`."""
+    """Read the bits per channel of an image file: 8, 16, or 32 for floats. Raises as `open_image` does."""
     suffix = path.suffix.lower()
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:
@@ -191,7 +192,7 @@ def bits_of(path: Path) -> int:
 
 
 def encodings(paths: Sequence[Path]) -> list[str]:
-    """How the pixels of image files are encoded, as a clause for each kind."""
+    """Describe the pixel encodings of image files, one clause for each encoding."""
     bits = Counter(bits_of(path) for path in paths)
     said = sum(statement_of(path) != Statement() for path in paths)
     kinds = {8: "8 bits are sRGB", 16: "16 bits are linear", 32: "floats are linear"}
@@ -200,17 +201,17 @@ def encodings(paths: Sequence[Path]) -> list[str]:
 
 
 def encoding_of(path: Path) -> Literal["srgb", "linear"]:
-    """The encoding of the pixels that `read_image` gives with `heed`."""
+    """Encoding of the pixels that `read_image` returns for this file with `heed`."""
     said = statement_of(path)
     sample = np.zeros((1, 1, 3), np.uint8)
     return "srgb" if bits_of(path) == 8 and as_stated(sample, said).dtype == np.uint8 else "linear"
 
 
 def exr_attributes(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Name and value of the attributes of an OpenEXR file; values are cut off after 64 KiB.
+    """Yield (name, value) of each header attribute of an OpenEXR file. Values are cut off after 64 KiB.
 
-    The header is a list of attributes ("OpenEXR File Layout"): name and type, which end in a zero byte, size, value.
-    Raises ValueError if it is no OpenEXR file, or one of several parts.
+    Format ("OpenEXR File Layout"): name and type, each ended by a zero byte; size; value. Raises ValueError if the file
+    is no OpenEXR file or has several parts.
     """
     with path.open("rb") as file:
 
@@ -230,7 +231,7 @@ def exr_attributes(path: Path) -> Iterator[tuple[bytes, bytes]]:
 
 
 def exr_channels(value: bytes) -> list[str]:
-    """The names of the channels in the attribute of that name: each is followed by a zero byte and 16 more bytes."""
+    """Parse the value of the attribute `channels`: channel names, each followed by a zero byte and 16 more bytes."""
     names, place = [], 0
     while value[place]:
         end = value.index(b"\0", place)
@@ -240,10 +241,10 @@ def exr_channels(value: bytes) -> list[str]:
 
 
 def exr_picture(names: Sequence[str]) -> list[str]:
-    """Which of an OpenEXR file's channels are the picture: R, G, B and A; Y and A; or its only channel.
+    """Choose the channels that form the picture: R, G, B and A; or Y and A; or the only channel.
 
-    Names may begin with that of a layer, as in `ViewLayer.Combined.R`, if one layer alone has R, G and B. Raises
-    ValueError if none is the picture, or several layers are.
+    Names may begin with a layer, as in `ViewLayer.Combined.R`, if only one layer has R, G and B. Raises ValueError if
+    no channels form a picture, or if several layers do.
     """
     layers = [name.removesuffix("R") for name in names if name == "R" or name.endswith(".R")]
     layers = [layer for layer in layers if {f"{layer}{c}" for c in "RGB"} <= {*names}]
@@ -258,9 +259,9 @@ def exr_picture(names: Sequence[str]) -> list[str]:
 
 
 def exr_size(path: Path) -> tuple[int, int, int]:
-    """Width [px], height [px] and number of channels that the header of an OpenEXR file declares.
+    """Read (width [px], height [px], number of channels) from the header of an OpenEXR file.
 
-    Raises ValueError if it has no pixels, or not those of the whole picture.
+    Raises ValueError if the file has no pixels, or only a part of the picture's pixels.
     """
     found = dict(exr_attributes(path))
     left, top, right, bottom = data = struct.unpack("<4i", found[b"dataWindow"])

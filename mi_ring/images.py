@@ -28,13 +28,13 @@ Pictures = TypeVar("Pictures", np.ndarray, Tensor)
 
 
 def linear_to_srgb(v: np.ndarray) -> np.ndarray:
-    """Convert linear values, clipped to [0, 1], to sRGB values."""
+    """Encode linear values as sRGB values. They are first clipped to [0, 1]."""
     v = np.clip(v, 0, 1)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def contrasted(linear: Pictures, contrast: Any) -> Pictures:
-    """Apply an S-curve, like that of film, to linear values. Values of 1 and above do not change.
+    """Apply an S-curve, like that of film, to linear values. Values of at least 1 do not change.
 
     It maps an sRGB value v to vᶜ / (vᶜ + (1 − v)ᶜ), where c is `contrast`. The inverse is the curve with 1 / c.
     """
@@ -48,7 +48,7 @@ def contrasted(linear: Pictures, contrast: Any) -> Pictures:
 
 
 def to_bytes(encoded: np.ndarray) -> np.ndarray:
-    """Convert values, clipped to [0, 1], to uint8 from 0 to 255."""
+    """Convert values in [0, 1] to uint8 in 0 to 255. Values outside are clipped."""
     return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -60,10 +60,10 @@ def box_filter(image: Tensor, scale: int) -> Tensor:
 
 
 def read_image(path: Path, heed: bool = False) -> np.ndarray:
-    """The pixels (H, W, C) of an image file: uint8, uint16 or float32. Raw files are developed: linear, uint16.
+    """Read the pixels (H, W, C) of an image file: uint8, uint16 or float32. Raw files become linear uint16.
 
-    `heed`: obey what the file says about its colours, so that 8 bits are sRGB and all others linear, see
-    `colour_profiles.as_stated`. Without it: the pixels as they are stored.
+    `heed`: convert pixels by the colour space that the file declares, so that 8 bits are sRGB and all others linear;
+    see `colour_profiles.as_stated`. Without it: pixels as stored.
 
     Raises ValueError for CMYK, for integers of more than 16 bits, for several parts and for an implausible size, before
     memory is allocated; other errors for damaged files.
@@ -92,7 +92,7 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
 
 
 def read_tiff(path: Path) -> np.ndarray:
-    """The pixels of the first page of a TIFF file. Raises ValueError as `read_image` does."""
+    """Read the pixels (H, W, C) of the first page of a TIFF file. Raises ValueError as `read_image` does."""
     kinds = tifffile.PHOTOMETRIC
     with tifffile.TiffFile(path) as file:
         page = file.pages.first
@@ -130,7 +130,7 @@ def read_tiff(path: Path) -> np.ndarray:
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """The pixels in the channels `exr_picture` of an OpenEXR file: float32."""
+    """Read the channels of an OpenEXR file that `exr_picture` chooses: (H, W, C) float32."""
     width, height, channels = exr_size(path)
     require_plausible_size(path, 4 * width * max(height, EXR_CHUNK) * channels)
     with exr_threads():
@@ -142,14 +142,17 @@ def read_exr(path: Path) -> np.ndarray:
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Linear radiance in sRGB's primaries, with the camera's white balance, of a raw file: uint16."""
+    """Develop a raw file to linear radiance with sRGB's primaries and the camera's white balance: (H, W, 3) uint16."""
     with need("rawpy", f"{path}").imread(str(path)) as raw:
         require_plausible_size(path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
         return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
 
 
 def mask_values(pixels: np.ndarray) -> np.ndarray:
-    """A mask (H, W) uint8 in the pixels (H, W, C) of its file: the alpha channel if that varies, else the first."""
+    """Take the mask (H, W) uint8 from the pixels (H, W, C) of its file.
+
+    It is the alpha channel if that is not constant, otherwise the first channel.
+    """
     channel = pixels[..., 0]
     if pixels.shape[2] in (2, 4) and pixels[..., -1].min() < pixels[..., -1].max():
         channel = pixels[..., -1]
@@ -158,19 +161,19 @@ def mask_values(pixels: np.ndarray) -> np.ndarray:
 
 
 def orientation_axes(orientation: int) -> np.ndarray:
-    """(3, 3) from the axes (x right, y down, z forward) of stored pixels to those after a turn by an orientation."""
+    """Matrix (3, 3) from the axes of stored pixels (x right, y down, z forward) to those after an EXIF orientation."""
     column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
     return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
 
 
 def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Pixels (H, W, …) turned by an EXIF orientation."""
+    """Rotate or mirror pixels (H, W, …) upright, by an EXIF orientation."""
     column, row = orientation_axes(orientation)[:2, :2].sum(1).astype(int)
     return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation > 4 else pixels)[::row, ::column])
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Blur images (..., H, W) by a Gaussian of `sigma` > 0 [px]. Pixels outside count as zero."""
+    """Blur images (..., H, W) with a Gaussian of standard deviation `sigma` > 0 [px]. Outside, pixels count as zero."""
     radius = int(3 * sigma + 0.5)
     total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
 
@@ -182,7 +185,7 @@ def blur(images: Tensor, sigma: float) -> Tensor:
 
 
 def write_image(pixels: np.ndarray, path: Path) -> None:
-    """Write an image (H, W, C) by `write_file`. The suffix says the format: .png, .exr, otherwise JPEG."""
+    """Write an image (H, W, C) in the format of the path's suffix: .png, .exr, otherwise JPEG."""
     formats = mi.Bitmap.FileFormat
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
     stream = mi.MemoryStream()
@@ -192,7 +195,7 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
 
 
 def encoded_picture(picture: Image.Image, kind: str = "PNG", **options: Any) -> bytes:
-    """Encode an image as the content of a file. `kind` and `options` are those of Pillow's `save`."""
+    """Encode a Pillow image as the bytes of a file. `kind`: its format; `options`: those of Pillow's `save`."""
     buffer = io.BytesIO()
     picture.save(buffer, kind, **options)
     return buffer.getvalue()

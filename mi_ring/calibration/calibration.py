@@ -37,7 +37,7 @@ ROOM_START = 0.15  #: progress of a fit at which refinement of the room's light 
 
 
 class Calibration(nn.Module):
-    """Unknowns of calibration and their values, in standard deviations of their priors: 0 is what the capture says."""
+    """The unknowns of calibration as parameters, in standard deviations of their priors; 0: the capture's value."""
 
     def __init__(
         self, capture: Capture, refined: Sequence[str], rig: Rig, frames: Collection[str] = ("world",)
@@ -64,63 +64,68 @@ class Calibration(nn.Module):
         self.room = RoomLight(room, rig.exposure, frames, alone)
 
     def value(self, name: str) -> Tensor:
-        """The value of the unknown `name` in its own unit; 0 if it is not refined."""
+        """Return the current value of the unknown `name` in its own unit; 0 if it is not refined."""
         return getattr(self, name) * self.widths[name] if name in self.widths else torch.zeros(())
 
     def estimate(self) -> Estimate:
-        """Apply all unknowns to the rig: its cameras, lights and response with the current values."""
+        """Apply the current values of all unknowns to the capture's cameras, lights and response."""
         now = self.rig.estimate()
         for name, unknown in self.unknowns.items():
             now = unknown.apply(now, self.value(name), self.rig)
         return now
 
     def forward(self, scale: int = 1) -> Views:
-        """The cameras and lights with the current values, for photographs that are `scale` times smaller."""
+        """Return the current cameras and lights for photographs that are `scale` times smaller."""
         views = self.rig.views_of(self.estimate())
         return views if scale == 1 else views._replace(intrinsics=views.intrinsics / scale)
 
     def lamps(self) -> LightTensors:
-        """The scene's own lamps with the current values of their unknowns."""
+        """Return the current lamps of the scene."""
         return self.rig.lamps_of(self.estimate())
 
     def lamp_tensors(self) -> list[Tensor]:
-        """Places and strengths (L, 3) of the scene's L lamps for the renderer; empty if lamps are not refined."""
+        """List [places (L, 3), strengths (L, 3)] of the scene's L lamps; [] if lamps are not refined."""
         if "lamps" not in self.refined:
             return []
         now = self.lamps()
         return [now.places.to(device()), now.strengths.to(device())]
 
     def solves_room(self, progress: float) -> bool:
-        """Does the fit solve for the room's light at this progress (0 to 1)? Always if there is no other light."""
+        """Test whether the fit estimates the room's light at this progress (0 to 1).
+
+        Without other light it always does.
+        """
         return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
 
     @torch.no_grad()
     def relight(self, surface: Surface) -> None:
-        """Give the lamps of a surface's scene their current values; nothing if lamps are not refined."""
+        """Set the lamps in the scene of `surface` to their current values. Does nothing if lamps are not refined."""
         if lamps := self.lamp_tensors():
             surface.relight(*map(bridge.to_drjit, lamps))
 
     @property
     def albedo_factor(self) -> float:
-        """The factor of the albedo by which directly lit surfaces keep their brightness when `scale` changes."""
+        """Factor of the albedo that keeps directly lit surfaces equally bright when the unknown `scale` changes."""
         return math.exp(-float(self.value("scale").detach()))
 
     @property
     def power_factor(self) -> float:
-        """The factor that the fit has found for the strengths of all lights."""
+        """Common factor of all light strengths that the fit has estimated."""
         return self.rig.power / self.albedo_factor
 
     def indirect(self, light: Tensor) -> Tensor:
-        """Interreflection `light` (n, H, W, 3) of the current surface, attached to the unknown `scale`.
+        """Give interreflection `light` (n, H, W, 3) a gradient for the unknown `scale`; its values do not change.
 
-        Only the gradient is new: stronger lights mean a darker surface, and each bounce after the first loses one
-        factor of the albedo.
+        Stronger lights mean a darker surface, and each bounce after the first loses one factor of the albedo.
         """
         scale = self.value("scale").to(light)
         return light * (scale.detach() - scale).exp()
 
     def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Cosines (N, H, W, 1) between the optical axis and the rays of photographs `index`, `scale` times smaller."""
+        """Cosine (N, H, W, 1) of the angle between the optical axis and each pixel's ray.
+
+        `index` (N,): the photographs, which are `scale` times smaller.
+        """
         width, height = (size // scale for size in self.rig.sizes[index[0]])
         views = self(scale)
         fx, fy, cx, cy = (views.intrinsics[index].detach().T)[..., None, None]
@@ -131,39 +136,45 @@ class Calibration(nn.Module):
         return (1 + distance2)[..., None] ** -0.5
 
     def response(self) -> CameraResponse:
-        """The camera response with the current values."""
+        """Return the camera response with the current values."""
         return self.estimate().response
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """What cameras record of radiance (N, H, W, 3): photographs `index`, which are `scale` times smaller."""
+        """Convert scene radiance (N, H, W, 3) to what the cameras record.
+
+        `index` (N,): the photographs, which are `scale` times smaller.
+        """
         response = self.response()
         return response.recorded(radiance, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """The radiance of which cameras record `recorded` (N, H, W, 3), without gradients; inverse of that method."""
+        """Convert recorded values (N, H, W, 3) to scene radiance, without gradients: the inverse of `recorded`."""
         response = self.response()
         return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     def refined_photographs(self, photographs: Photographs, views: Views) -> Photographs:
-        """Give photographs the cameras and lights of `views` and the current light of the room, for the renderer.
+        """Return `photographs` for the renderer with the cameras and lights of `views` and the current room light.
 
-        `views`: cameras and lights of all P photographs. The result is without gradients.
+        `views`: cameras and lights of all P photographs. The result has no gradients.
         """
         room = self.room_harmonics().double().numpy(force=True)
         return replace(prediction.with_views(photographs, views), room=room if room.any() else None)
 
     def room_harmonics(self) -> Tensor:
-        """Current harmonics (BASIS, 3) of the room light. If they are not refined, `scale` applies to them."""
+        """Return the current spherical harmonics (BASIS, 3) of the room.
+
+        If they are not refined, `scale` applies to them.
+        """
         harmonics = self.room.harmonics
         return harmonics if "ambient" in self.refined else harmonics / self.albedo_factor
 
     @torch.no_grad()
     def room_share(self, harmonics: Tensor) -> Tensor:
-        """Compare the light of a room, harmonics (BASIS, 3), with the photographs' own lights at the object.
+        """Compare room light, `harmonics` (BASIS, 3), with the photographs' own lights at the object.
 
-        Returns the room's mean irradiance (3,) relative to that of a surface which faces the light. If photographs have
-        no lights of their own: the room's mean radiance.
+        Returns the room's mean irradiance (3,), divided by that of a surface facing a light. If photographs have no
+        lights of their own, returns the room's mean radiance (3,).
         """
         now = self()
         distance2 = torch.where(self.rig.finite, (now.places - self.rig.center).square().sum(-1, keepdim=True), 1.0)
@@ -172,11 +183,14 @@ class Calibration(nn.Module):
         return mean / own if bool((own > 0).all()) else mean / math.pi
 
     def prior(self) -> Tensor:
-        """The loss of all unknowns: half the sum of their squares, divided by the number of photographs."""
+        """Loss of the Gaussian priors: half the sum of squares of all unknowns, per photograph."""
         return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.rig)
 
     def parameters_without_solver(self) -> list[list[Tensor]]:
-        """The tensors of unknowns that have no solver of their own and follow their gradients, one list per option."""
+        """List the parameters that an optimiser follows by gradient, because no solver estimates them.
+
+        One list per option of `--refine`.
+        """
         groups: dict[str, list[Tensor]] = {}
         for name, unknown in self.unknowns.items():
             if not unknown.solved:
@@ -184,7 +198,10 @@ class Calibration(nn.Module):
         return list(groups.values())
 
     def current_and_given(self, option: str) -> list[tuple[Tensor, Tensor]]:
-        """Pairs of tensors for the unknowns of an `option`: current value, to be changed in place; capture's value."""
+        """List pairs (current value, value of the capture) of tensors for the unknowns of an `option` of `--refine`.
+
+        The current value may be changed in place.
+        """
         if option == "ambient":
             return [(self.room.harmonics, self.room.given)]
         own = [getattr(self, name) for name, unknown in self.unknowns.items() if unknown.option == option]
@@ -192,7 +209,7 @@ class Calibration(nn.Module):
 
     @torch.no_grad()
     def applied(self, capture: Capture) -> Capture:
-        """A capture like the given one, with the current cameras, lights, lamps and response."""
+        """Return the capture with the current cameras, lights, lamps and camera response."""
         estimate = self.estimate()
         views, lamps = self.rig.views_of(estimate), self.rig.lamps_of(estimate)
         gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))

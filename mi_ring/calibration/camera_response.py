@@ -14,7 +14,10 @@ DARKEST = 1e-4  #: radiance, in units of the exposure, below which the power cur
 
 
 class CameraResponse(NamedTuple):
-    """The camera response of P photographs: vignetting, gains and one tone curve. A field of None is not refined."""
+    """The camera response of P photographs: vignetting, gains and a tone curve.
+
+    A field is None if it is not refined.
+    """
 
     exponent: Tensor | None  #: logarithm of the curve's exponent: the decoded value is radiance to this power
     contrast: Tensor | None  #: logarithm of the steepness of the curve's S
@@ -27,28 +30,31 @@ class CameraResponse(NamedTuple):
 
     @property
     def has_vignetting(self) -> bool:
-        """Is there any vignetting, known or refined? Then `recorded` and `linear` need the cosines of the pixels."""
+        """Test whether there is vignetting, known or refined. `recorded` and `linear` then need `cosines`."""
         return self.vignetting is not None or bool(self.known_vignetting.any())
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """What cameras record of radiance (N, ..., 3), after decoding by what the capture knows of their response.
+        """Convert scene radiance (N, ..., 3) to what cameras record, after the known part of their response is removed.
 
-        `index` (N,): the photographs. `cosines` (N, ..., 1): between the pixels' rays and the optical axis, needed with
-        vignetting.
+        `index` (N,): the photographs. `cosines` (N, ..., 1): of the angle between pixel ray and optical axis; needed
+        with vignetting.
         """
         known, unknown = self.factors(radiance, index, cosines)
         return self.with_curve(radiance * known * unknown, self.gammas[index]) / known
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """The radiance of decoded photographs (N, ..., 3), without gradients; the inverse of the method `recorded`."""
+        """Convert recorded values (N, ..., 3) to scene radiance, without gradients: the inverse of `recorded`."""
         known, unknown = self.factors(recorded, index, cosines)
         return self.without_curve(recorded * known, self.gammas[index]) / known / unknown
 
     def factors(
         self, like: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None
     ) -> tuple[Tensor | float, Tensor | float]:
-        """Factors (N, ..., 3) of vignetting and gain, in the type of `like`: what the capture knows, what was found."""
+        """Return (known, refined) factors (N, ..., 3) of vignetting times gain, in the dtype of `like`.
+
+        The known factors are those of the capture. Each is 1.0 if there is none.
+        """
         ones = [1] * (like.ndim - 2)
 
         def by_photograph(values: Tensor) -> Tensor:
@@ -63,7 +69,10 @@ class CameraResponse(NamedTuple):
         return known, unknown
 
     def with_curve(self, radiance: Tensor, gammas: Tensor) -> Tensor:
-        """Apply the tone curve to radiance (N, ...). `gammas` (N,): the exponents that the capture knows."""
+        """Apply the tone curve to radiance (N, ...).
+
+        `gammas` (N,): exponents of the photographs, known from the capture.
+        """
         if self.exponent is not None:
             relative = radiance / self.exposure
             radiance = radiance * relative.clamp(min=DARKEST) ** (self.exponent.exp().to(radiance) - 1)
@@ -81,9 +90,9 @@ class CameraResponse(NamedTuple):
 
 
 def with_contrast(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
-    """Apply an S curve to values (N, ...) that the capture decoded with `gammas` (N,). `contrast`: steepness of the S.
+    """Apply an S-curve of steepness `contrast` to values (N, ...) that were decoded with the exponents `gammas` (N,).
 
-    Two S curves in a row are one, whose steepness is the product. So the capture's own contrast is not needed.
+    Two S-curves in a row are one, whose steepness is the product. So the capture's own contrast is not needed.
     """
     gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
     lit = values.clamp(min=BLACK)  # below it the curve is a straight line

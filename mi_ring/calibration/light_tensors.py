@@ -28,7 +28,10 @@ class LightTensors(NamedTuple):
         return cls(at, torch.tensor(finite, dtype=torch.bool)[:, None], rgb)
 
     def moved(self, offset: Tensor, distance: float) -> "LightTensors":
-        """Move lights by `offset` (L, 3) in units of `distance` [scene units]; turn distant lights by it [rad]."""
+        """Move point lights by `distance` [scene units] times `offset` (L, 3).
+
+        Distant lights are rotated by `offset` [rad] instead.
+        """
         moved = self.places + offset * torch.where(self.finite, distance, 1.0)
         return self._replace(places=torch.where(self.finite, moved, F.normalize(moved, dim=-1)))
 

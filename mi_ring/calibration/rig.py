@@ -20,7 +20,10 @@ INSIDE = 0.999  #: share of the range in which a lens distortion can be inverted
 
 @dataclass(frozen=True)
 class Estimate:
-    """The cameras, lights and response that unknowns change, one after the other, from what the capture says."""
+    """Estimated cameras, lights and camera response.
+
+    It starts from the capture, and each unknown changes it in turn.
+    """
 
     views: Views  #: lights as in the capture
     offset: Tensor  #: (light places, 3) or (): of the lights [rig's distance], of distant ones [rad]
@@ -30,15 +33,15 @@ class Estimate:
     response: CameraResponse
 
     def seen(self, **views: Tensor) -> "Estimate":
-        """A copy of the estimate in which some tensors of `views` are replaced by those given, by name."""
+        """Return a copy in which the tensors given by name replace those of `views`."""
         return replace(self, views=self.views._replace(**views))
 
 
 class Rig:
-    """The cameras and lights of a capture as tensors, as the capture says. They do not change during a fit.
+    """Cameras and lights as the capture gives them, as tensors that stay constant during a fit.
 
-    Photographs share a `lens` if focal lengths and distortion are equal, and a light's `place` if that is equal. A
-    flash that moves with the camera has one place for all photographs, in the cameras' axes.
+    Photographs with equal focal lengths and distortion share a `lens`. Photographs with the same light position share a
+    `place`; a flash that moves with the camera has one place for all, in camera coordinates.
     """
 
     def __init__(
@@ -96,18 +99,18 @@ class Rig:
         return len(self.lens)
 
     def count(self, per: str) -> int:
-        """How many photographs, lenses, lights or lamps there are. `per`: "photograph", "lens", "light" or "lamp"."""
+        """Return how many there are of `per`: "photograph", "lens", "light" or "lamp"."""
         several = {"photograph": len(self), "lens": int(self.lens.max()) + 1, "light": int(self.place.max()) + 1,
                    "lamp": len(self.lamps.places)}  # fmt: skip
         return several[per]
 
     def estimate(self) -> Estimate:
-        """An estimate that equals the capture; unknowns are applied to it."""
+        """Return the estimate that equals the capture, before unknowns change it."""
         none = torch.zeros(())
         return Estimate(self.views, none, none, none, none, self.response)
 
     def views_of(self, estimate: Estimate) -> Views:
-        """The cameras and lights of an estimate, with its offsets and factors applied."""
+        """Return the cameras and lights of an estimate. Its offsets and factors of lights are applied."""
         now = estimate.views
         offset = (self.free * estimate.offset).expand(self.count("light"), 3)[self.place]
         if self.flash is not None:
@@ -123,6 +126,6 @@ class Rig:
         return now._replace(places=places, strengths=now.strengths * estimate.log_power.exp(), distortion=distortion)
 
     def lamps_of(self, estimate: Estimate) -> LightTensors:
-        """The scene's own lamps of an estimate, with its offsets and factors applied."""
+        """Return the scene's lamps with the offsets and factors of an estimate applied."""
         strengths = self.power * estimate.log_lamp_power.exp() * self.lamps.strengths
         return self.lamps._replace(strengths=strengths).moved(estimate.lamp_offset, self.distance)

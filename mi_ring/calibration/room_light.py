@@ -20,7 +20,7 @@ FINE = 0.3  #: progress from which the only light has its full order
 
 
 class RoomLight(nn.Module):
-    """The light of a room as an unknown: its spherical harmonics, and the normal equations that determine them."""
+    """Room light as an unknown: its spherical harmonics, and the normal equations from which they are estimated."""
 
     which: list[int]  #: numbers of the harmonics that may be non-zero
     given: Tensor  #: (BASIS, 3) from the capture
@@ -45,7 +45,7 @@ class RoomLight(nn.Module):
         self.register_buffer("vector", torch.zeros(3, BASIS))
 
     def forget(self) -> None:
-        """Reset the normal equations. The harmonics stay."""
+        """Discard all photographs that were added to the normal equations. The harmonics stay."""
         self.matrix.zero_()
         self.vector.zero_()
 
@@ -54,11 +54,11 @@ class RoomLight(nn.Module):
         self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
         total: Callable[[Tensor], Tensor] = lambda equations: equations,
     ) -> None:  # fmt: skip
-        """Add photographs to the normal equations and solve them for the harmonics.
+        """Add photographs to the normal equations, and solve for the harmonics.
 
-        `around`: the radiance that each harmonic adds to the photographs. `observed`, `predicted` (N, H, W, 3): linear
-        radiance, predicted with the current room light as if nothing occluded it. `counted` (N, H, W) bool: pixels that
-        show the object. `progress`: of the fit, in [0, 1]. `total`: sums tensors over all processes.
+        `around`: how the photographs respond to each harmonic. `observed`, `predicted` (N, H, W, 3): linear radiance;
+        the prediction contains the current room light without occlusion. `counted` (N, H, W) bool: pixels that show the
+        object. `progress`: of the fit, in [0, 1]. `total`: function that sums a tensor over all processes.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:

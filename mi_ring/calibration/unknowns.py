@@ -27,7 +27,7 @@ VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measu
 
 
 class Found(NamedTuple):
-    """The result of a calibration that `Unknown.describe` puts into words: the capture before and after the fit."""
+    """The capture before and after a fit, with what else `Unknown.describe` needs to put the calibration into words."""
 
     rig: Rig
     before: Capture  #: as the capture says
@@ -37,14 +37,14 @@ class Found(NamedTuple):
     several: bool  #: Are the photographs' lights the first of several unknown lamps?
 
     def means(self, of: Callable[[Shot], float]) -> tuple[float, float]:
-        """Means over all photographs of the number that `of` gives for each: before and after the fit."""
+        """Mean of `of(shot)` over all photographs. Returns (mean before the fit, mean after the fit)."""
         before, after = (float(np.mean([of(shot) for shot in side.shots])) for side in (self.before, self.after))
         return before, after
 
 
 @dataclass(frozen=True)
 class Unknown(ABC):
-    """An unknown of calibration, with `components` numbers for each photograph, lens, light or lamp."""
+    """Base class of the unknowns of calibration. Each has `components` numbers per photograph, lens, light or lamp."""
 
     name: str
     option: str  #: of `--refine`
@@ -59,19 +59,22 @@ class Unknown(ABC):
     solved: ClassVar[bool] = False  #: Has it a solver in `fitting`? Others follow their gradient by Adam.
 
     def shape(self, rig: Rig) -> tuple[int, ...]:
-        """The shape of the parameter for a rig: (several, components), without the dimensions that are 1."""
+        """Shape of the parameter: (number of photographs, lenses, lights or lamps; components).
+
+        The first is left out if the whole capture has one value, the second if it is 1.
+        """
         several = () if self.per == "capture" else (rig.count(self.per),)
         return several + (self.components,) * (self.components > 1)
 
     def width_for(self, rig: Rig) -> float:
-        """The standard deviation of the prior for a rig, in the unknown's own unit."""
+        """Standard deviation of the prior for this rig, in the unknown's own unit."""
         return self.width
 
     def rows(self, rig: Rig, index: np.ndarray) -> list[np.ndarray]:
-        """Which rows of the parameter each of the photographs `index` (n,) depends on.
+        """Find the rows of the parameter that affect the photographs `index` (n,).
 
-        Each array (n,) holds one row number per photograph. There is one array, or one for each lamp, because all lamps
-        light every photograph.
+        Returns arrays (n,) that hold one row number per photograph: one array for each lamp, because all lamps light
+        every photograph; a single array for other unknowns.
         """
         if self.per == "lamp":  # all lamps light all photographs
             return [np.full_like(index, k) for k in range(rig.count("lamp"))]
@@ -82,17 +85,22 @@ class Unknown(ABC):
 
     @abstractmethod
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        """The estimate `now`, changed by this unknown. `value`: of the unknown in its own unit."""
+        """Return the estimate `now`, changed by this unknown. `value`: the unknown's current value, in its own unit."""
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any] | None:
-        """Describe the result for people: name, value before the fit, value after it, standard deviation; or None.
+        """Describe the result in words.
 
-        `value`, `std`: of the parameter, in the unknown's own unit.
+        Returns (name, value before the fit, value after it, standard deviation), or None. `value`, `std`: value and
+        standard deviation of the parameter, in the unknown's own unit.
         """
         return None
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any] | None:
-        """Describe the result of one photograph: key in calibration.json, value, standard deviation; or None."""
+        """Describe the result for one photograph.
+
+        Returns (key in calibration.json, value, standard deviation), or None. `value`, `std`: those of this photograph,
+        in the unknown's own unit.
+        """
         return None
 
 
@@ -126,7 +134,7 @@ class Move(Unknown):
 
 
 class Focal(Unknown):
-    """Logarithm of a factor of each lens's focal length."""
+    """Logarithm of a correction factor of each lens's focal length."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         focal, centre = now.views.intrinsics.split(2, 1)
@@ -151,7 +159,7 @@ class Principal(Unknown):
 
 
 class Distortion(Unknown):
-    """First radial distortion coefficient of each lens, to be added to the one that the capture knows."""
+    """Correction that is added to the first radial distortion coefficient of each lens."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return now.seen(distortion=now.views.distortion + value[rig.lens])
@@ -162,7 +170,7 @@ class Distortion(Unknown):
 
 
 class LightPlace(Unknown):
-    """Offset of the place of each light [distance of the rig], or of the direction of a distant light [rad]."""
+    """Offset of each light's position [distance of the rig]; of a distant light: of its direction [rad]."""
 
     def width_for(self, rig: Rig) -> float:
         return self.width * (VAGUE if rig.guessed else 1.0)
@@ -184,7 +192,7 @@ class LightPlace(Unknown):
 
 
 class Exposure(Unknown):
-    """Logarithm of a factor for each photograph and colour, the base class of `Power` and `Gain`. Their mean is 0."""
+    """Base class of `Power` and `Gain`: logarithm of a factor for each photograph and colour channel, with mean 0."""
 
     solved = True
 
@@ -194,7 +202,7 @@ class Exposure(Unknown):
 
 
 class Power(Exposure):
-    """Logarithm of the factor of each photograph's light, by colour."""
+    """Logarithm of a factor of each photograph's light, for each colour channel."""
 
     changes = "light"
 
@@ -203,7 +211,7 @@ class Power(Exposure):
 
 
 class Falloff(Unknown):
-    """Exponent of the cosine about the flash's axis, to be added to the one that the capture knows."""
+    """Correction that is added to the cosine exponent of the flash's cone."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return now.seen(falloff=now.views.falloff + value)
@@ -213,7 +221,7 @@ class Falloff(Unknown):
 
 
 class Vignetting(Unknown):
-    """Exponent of the cosine about the optical axis, to be added to the one that the capture knows."""
+    """Correction that is added to the cosine exponent of the lens's vignetting."""
 
     changes = "recording"
 
@@ -251,7 +259,10 @@ class Contrast(Unknown):
 
 
 class Gain(Exposure):
-    """Logarithm of a factor of what each photograph records, by colour. Its solver does without gradients."""
+    """Logarithm of a factor of the values that each photograph records, for each colour channel.
+
+    A solver estimates it without gradients.
+    """
 
     changes = "gain"
 
@@ -260,7 +271,10 @@ class Gain(Exposure):
 
 
 class Scale(Unknown):
-    """Logarithm of one factor of all lights. Albedo cancels it in direct light, so indirect light determines it."""
+    """Logarithm of a common factor of all lights.
+
+    Only indirect light determines it: in direct light albedo cancels it.
+    """
 
     changes = "indirect"
 
@@ -273,7 +287,7 @@ class Scale(Unknown):
 
 
 class LampPlace(LightPlace):
-    """Offset of the place of each lamp of the scene, in the units of `LightPlace`."""
+    """Offset of each lamp of the scene, in the units of `LightPlace`."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return replace(now, lamp_offset=value)
@@ -286,7 +300,7 @@ class LampPlace(LightPlace):
 
 
 class LampPower(Unknown):
-    """Logarithm of a factor of the strength of each lamp of the scene, by colour."""
+    """Logarithm of a factor of each lamp of the scene, for each colour channel."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return replace(now, log_lamp_power=value + now.log_lamp_power)
@@ -324,13 +338,13 @@ OWN_LIGHTS = {unknown.option for unknown in UNKNOWNS.values() if unknown.own_lig
 
 
 def centred(value: Tensor, rig: Rig) -> Tensor:
-    """Subtract from `value` (P, 3), logarithms of factors, the mean over fitted photographs; 0 for those held out."""
+    """Subtract the mean over fitted photographs from log factors `value` (P, 3); 0 for held-out photographs."""
     result = torch.zeros_like(value)
     result[rig.fitted] = value[rig.fitted] - value[rig.fitted].mean(0)
     return result
 
 
 def lens_cameras(found: Found) -> Iterable[list]:
-    """For each lens, the camera of its first photograph: once before, once after the fit."""
+    """Yield for each lens the camera of its first photograph: [before the fit, after the fit]."""
     first = np.unique(found.rig.lens.numpy(), return_index=True)[1]
     return ([side.shots[k].whole.camera for k in first] for side in (found.before, found.after))

@@ -28,7 +28,10 @@ Item = TypeVar("Item")
 
 
 def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarray]:
-    """Check photographs and return them as arrays (H, W, 3). Raises InputError if there are none or one is invalid."""
+    """Check photographs and return them as arrays (H, W, 3).
+
+    Raises InputError if the list is empty or one is invalid.
+    """
     if encoding not in ("auto", "srgb", "linear"):
         raise InputError(f"encoding: is {encoding!r}, must be one of auto, srgb, linear")
     found = [image_of(image, encoding, f"images[{k}]") for k, image in enumerate(images)]
@@ -38,7 +41,10 @@ def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarra
 
 
 def masks_of(masks: Iterable[ArrayLike | None] | None, images: Sequence[np.ndarray], what: str) -> Pixels:
-    """Check the masks of images: 255 inside. Raises InputError, which begins with `what`, if one is invalid."""
+    """Check the masks of `images` and return them as uint8 arrays (H, W), 255 on the object.
+
+    Raises InputError if one is invalid; `what` begins the message.
+    """
     several = zip(one_each(masks, len(images), what), images)
     return Pixels.of([mask_of(mask, image, f"{what}[{k}]") for k, (mask, image) in enumerate(several)])
 
@@ -47,7 +53,7 @@ def shots_of(
     images: Sequence[np.ndarray], cameras: Iterable[Camera], lights: Iterable[Light | None] | None,
     names: Sequence[str] | None, encoding: Encoding, saturation: float, calibrated: bool,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """Make the `Shot` of each image from arguments of `Capture.from_arrays`. Raises InputError if one is invalid."""
+    """Make the `Shot` of each image. Arguments: as for `Capture.from_arrays`. Raises InputError if one is invalid."""
     count = len(images)
     full = float(numbers(saturation, (), "saturation"))
     if not full > 0:
@@ -61,7 +67,10 @@ def shots_of(
 
 
 def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item | None]:
-    """List one item per photograph; None for each if `items` is None. Raises InputError unless there are `count`."""
+    """Return one item per photograph; a list of None if `items` is None.
+
+    Raises InputError unless there are `count` items.
+    """
     found: list[Item | None] = [None] * count if items is None else list(items)
     if len(found) != count:
         raise InputError(f"{what}: has {len(found)} for {count} images; give one for each")
@@ -69,7 +78,10 @@ def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item |
 
 
 def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
-    """Check a photograph and return it as (H, W, 3). Raises InputError, which begins with `what`, if it is invalid."""
+    """Check a photograph and return it as an array (H, W, 3).
+
+    Raises InputError if invalid; `what` begins the message.
+    """
     array = np.asarray(image)
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 3 or array.shape[2] != 3 or not array.size:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be (H, W, 3) of uint8, uint16 or "
@@ -84,7 +96,10 @@ def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
 
 
 def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray | None:
-    """Check a mask: (H, W) uint8, 255 inside, of the size of `image`. Raises InputError, which begins with `what`."""
+    """Check a mask and return it as an array (H, W) uint8, 255 inside; None stays None.
+
+    Raises InputError if it is invalid or differs in size from `image`; `what` begins the message.
+    """
     if mask is None:
         return None
     array = np.asarray(mask)
@@ -97,7 +112,7 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
 
 
 def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
-    """Check the camera of an image and round it to float32. Raises InputError, which begins with `what`."""
+    """Check the camera of an image and round its numbers to float32. Raises InputError; `what` begins the message."""
     if not isinstance(camera, Camera):
         raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
     to_world, focal, centre, distortion = (
@@ -118,7 +133,7 @@ def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
 
 
 def light_of(light: object, what: str) -> Light | None:
-    """Check a light and round it to float32; None stays None. Raises InputError, which begins with `what`."""
+    """Check a light and round its numbers to float32; None stays None. Raises InputError; `what` begins the message."""
     if light is None:
         return None
     if not isinstance(light, Light) or light.kind not in ("point", "directional"):
@@ -131,7 +146,10 @@ def light_of(light: object, what: str) -> Light | None:
 
 
 def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Check that a value is finite numbers of this shape, and return them in float32. Otherwise raises InputError."""
+    """Convert a value to a float32 array of this shape.
+
+    Raises InputError, which begins with `what`, if that is impossible.
+    """
     try:
         array = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -144,7 +162,10 @@ def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def names_of(names: Sequence[str] | None, count: int) -> list[str]:
-    """Check names of `count` photographs; None gives 000, 001, …. Raises InputError if one is invalid or twice."""
+    """Check the names of `count` photographs; None gives 000, 001, ….
+
+    Raises InputError if one is invalid or repeated.
+    """
     if names is None:
         return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
     for k, name in enumerate(one_each(names, count, "names")):
@@ -165,12 +186,15 @@ def room_of(room: ArrayLike) -> np.ndarray:
 
 
 def sides(image: np.ndarray) -> str:
-    """Width and height of an image (H, W, …), as text."""
+    """Format the width and height of an image (H, W, …) for messages."""
     return "{} x {}".format(*image.shape[1::-1])
 
 
 def files_of(shot: Shot, image: np.ndarray, masked: bool, valid: bool) -> Files:
-    """Name the files of a photograph, relative to its scene file: EXR for float32, PNG for everything else."""
+    """Choose file names for a photograph and its masks, relative to the scene file: EXR for float32, PNG for all else.
+
+    `masked`, `valid`: does the photograph have a mask, and a mask of valid pixels?
+    """
     suffix = "exr" if image.dtype == np.float32 else "png"
     mask, shown = (Path(folder, f"{shot.name}.png") if there else None
                    for folder, there in (("masks", masked), ("valid", valid)))  # fmt: skip
@@ -193,7 +217,7 @@ def scene_xml(
 
 
 def write_array(array: np.ndarray, file: Path) -> None:
-    """Write a photograph (H, W, 3) or a mask (H, W), and make the folder. Raises InputError if this fails."""
+    """Write a photograph (H, W, 3) or a mask (H, W) to `file`, and make its folder. Raises InputError if this fails."""
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
     write_image(array if array.ndim == 3 else array[..., None], file)

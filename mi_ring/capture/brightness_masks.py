@@ -14,9 +14,9 @@ from mi_ring.images import box_filter
 
 
 def with_masks_by_brightness(capture: Capture) -> Capture:
-    """Give a capture masks of the pixels above `dark_threshold`. If the room was lit, returns the same capture.
+    """Return the capture with masks of all pixels brighter than `dark_threshold`. If the room was lit, nothing changes.
 
-    Such a mask contains the lit part of the object. Its shadowed part may be as dark as the room.
+    Such a mask contains the lit part of the object. The shadowed part may be as dark as the room.
     """
     threshold = dark_threshold(capture)
     if threshold is None:
@@ -29,7 +29,7 @@ def with_masks_by_brightness(capture: Capture) -> Capture:
 
 
 def dark_threshold(capture: Capture) -> float | None:
-    """Find the radiance above which a pixel is not the dark room; None if the room was lit."""
+    """Estimate the radiance below which a pixel may show the dark room. None if the room was lit."""
     some = [small_brightness(capture, k) for k in capture.spread(50)]
     values = np.concatenate([image.ravel() for image in some])
     if values.max() <= 0:
@@ -47,13 +47,19 @@ def dark_threshold(capture: Capture) -> float | None:
 
 
 def bright(capture: Capture, k: int, threshold: float) -> np.ndarray:
-    """Mask pixels of photograph `k` above a threshold: (H, W) uint8, 0 or 255. Small pieces are left out."""
+    """Make a mask (H, W) uint8 of photograph `k`: 255 where brighter than `threshold`, else 0.
+
+    Small pieces are left out.
+    """
     labels, sizes = pieces(brightness(capture, k) > threshold)
     return np.where(sizes[labels] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
 
 
 def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Label the connected pieces of a mask (...) bool: labels (...), 0 outside, and sizes by label; 0 for label 0."""
+    """Find connected components of a mask (...) bool. Returns (labels (...), component sizes by label).
+
+    Label 0 is the background; its size is given as 0.
+    """
     labels, _ = scipy.ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
@@ -61,12 +67,12 @@ def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_brightness(capture: Capture, k: int) -> np.ndarray:
-    """Reduce `brightness` of photograph `k` by block means: its shorter side gets 256 pixels or a little more."""
+    """Return `brightness` of photograph `k`, reduced by block means to a shorter side of 256 pixels or slightly more."""
     image = torch.from_numpy(brightness(capture, k))[..., None]
     return box_filter(image, max(1, min(image.shape[:2]) // 256))[..., 0].numpy()
 
 
 def brightness(capture: Capture, k: int) -> np.ndarray:
-    """Radiance (H, W) of photograph `k` in the brightest channel of each pixel."""
+    """Return radiance (H, W) of photograph `k`: the maximum over colour channels at each pixel."""
     image = capture.images[k]
     return decode(image, is_linear(capture.shots[k].encoding, image), 1.0)[0].max(-1)

@@ -36,7 +36,7 @@ LIT = 0.01  #: a room is lit if the background is brighter than this [brightness
 
 
 def require_variant(what: str | Path) -> None:
-    """Raise InputError, which begins with `what`, if the current variant of Mitsuba cannot fit."""
+    """Raise InputError if the current Mitsuba variant cannot be used for fits; `what` begins the message."""
     if mi.variant() not in ("llvm_ad_rgb", "cuda_ad_rgb"):
         why = llvm.missing() or "call mi.set_variant('llvm_ad_rgb') first"
         raise InputError(f"{what}: needs the variant llvm_ad_rgb or cuda_ad_rgb of Mitsuba, not {mi.variant()}; {why}")
@@ -115,7 +115,7 @@ class Capture:
 
     @property
     def in_memory(self) -> bool:
-        """Are the photographs arrays in memory, without files?"""
+        """Test whether the photographs are arrays in memory, without files."""
         return any(shot.files.filename is None for shot in self.shots)
 
     def save(self, path: str | Path) -> "Capture":
@@ -142,18 +142,21 @@ class Capture:
 
     @functools.cached_property
     def photographs(self) -> Photographs:
-        """Cameras, lights and room for the renderer. Raises SceneError for lights that cannot be rendered."""
+        """Cameras, lights and room light of all photographs, for the renderer.
+
+        Raises SceneError for unsupported lights.
+        """
         return Photographs.of(self.shots, self.room)
 
     @functools.cached_property
     def sizes(self) -> dict[tuple[int, int], np.ndarray]:
-        """Group the photographs by size, because one launch renders one size: indices by (width, height)."""
+        """Indices of the photographs by image size (width, height) [px], because one launch renders one size."""
         sizes = [shot.size for shot in self.shots]
         return {size: np.array([k for k, other in enumerate(sizes) if other == size]) for size in dict.fromkeys(sizes)}
 
     @property
     def known(self) -> bool:
-        """Does the scene say that all cameras and lights are exact?"""
+        """Test whether the scene declares all cameras and lights to be exact."""
         return all(shot.calibrated for shot in self.shots)
 
     def __len__(self) -> int:
@@ -161,7 +164,7 @@ class Capture:
 
     @functools.cached_property
     def names(self) -> list[str]:
-        """File names of the photographs; with folders if file names are not unique."""
+        """File name of each photograph; with folders if file names are not unique."""
         files = [Path(os.path.abspath(shot.files.filename or shot.name)) for shot in self.shots]
         names = [file.name for file in files]
         if len(set(names)) == len(names):
@@ -173,47 +176,47 @@ class Capture:
         return [file.relative_to(common).as_posix() for file in files]
 
     def part(self, index: Sequence[int] | np.ndarray) -> "Capture":
-        """A capture of only the photographs with these indices."""
+        """Return a capture that contains only the photographs with these indices."""
         pixels = {name: getattr(self, name).part(index) for name in ("images", "masks", "valid") if self.images}
         return replace(self, shots=tuple(self.shots[k] for k in index), **pixels)
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Capture":
-        """Move cameras and lights to another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
+        """Transform cameras and lights to another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
 
-        Use it for small motions: the rest of the scene (a room, a table, lamps) does not move.
+        Use it for small motions: the rest of the scene (room light, table, lamps) does not move.
         """
         return replace(self, shots=tuple(shot.moved(scale, rotation, shift) for shot in self.shots))
 
     def spread(self, most: int = 200) -> list[int]:
-        """Choose at most `most` photographs, evenly spaced: their indices."""
+        """Return the indices of at most `most` photographs, evenly spaced."""
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Split the photographs `index` into groups to render in one launch: of one size, at most `most` each."""
+        """Split the photographs `index` into groups of one size, at most `most` each, to render in one launch."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
                 yield chosen[start : start + most]
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
-        """Photograph `k` for the renderer, `scale` times smaller."""
+        """Return photograph `k` for the renderer, at 1 / `scale` of its size."""
         return self.selected([k], scale)
 
     def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
-        """Photographs `index`, all of one size, for the renderer, `scale` times smaller."""
+        """Return the photographs `index`, all of one size, for the renderer, at 1 / `scale` of this size."""
         return self.photographs.select(index, self.shots[index[0]].size, scale)
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
-        """Read the pixels of photographs `index`, all of one size, box-filtered to be `scale` times smaller."""
+        """Read the pixels of photographs `index`, all of one size, reduced `scale` times by a box filter."""
         return Observation.joined([self._observed.get(k, scale, partial(self._observe, k, scale)) for k in index])
 
     def _observe(self, k: int, scale: int) -> Observation:
         return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
     def exposure(self) -> float:
-        """Mean linear radiance of the object's pixels; without masks, of pixels above 2 % of the photograph's maximum.
+        """Mean linear radiance of the object's pixels. Without masks: of pixels above 2 % of the photograph's maximum.
 
-        Estimated from `SOME` photographs. Raises InputError if all these pixels are black.
+        It is estimated from `SOME` photographs. Raises InputError if all these pixels are black.
         """
         total, count = 0.0, 0
         for k in self.spread(SOME):
@@ -227,7 +230,10 @@ class Capture:
 
     @functools.cached_property
     def lit_room(self) -> bool:
-        """Is the background lit, by the masks? In a black room, black pixels show that no object is there."""
+        """Test whether pixels outside the masks are lit.
+
+        In a dark room, black pixels show that the object is not there.
+        """
         shares = []
         for k in self.spread(SOME):
             rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.shots[k].size) // COARSE))
@@ -239,22 +245,28 @@ class Capture:
         return bool(shares) and float(np.median(shares)) > LIT
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
-        """Rough reflectance of a surface at `center` (3,) whose mean radiance in the photographs is `exposure`.
+        """Estimate the reflectance of a surface at `center` (3,) whose mean radiance in the photographs is `exposure`.
 
-        If the photographs have no lights of their own, it is that of `ALBEDO`.
+        It is ALBEDO / π if no known light reaches the surface.
         """
         received = float(np.median(self.photographs.irradiance(center).mean(1)))
         return exposure / received if received > 0 else ALBEDO / math.pi
 
     @property
     def up(self) -> np.ndarray:
-        """Mean of the cameras' up directions (3,), unit length; that of the first camera if they cancel out."""
+        """Mean up direction (3,) of the cameras, unit length.
+
+        If the up directions cancel out, that of the first camera.
+        """
         ups = np.stack([shot.camera.up for shot in self.shots])
         up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
         return up / np.linalg.norm(up)
 
     def silhouettes(self, most: int | None = None) -> list[Silhouette]:
-        """The reduced masks with their cameras, without duplicates; at most `most`, evenly spaced."""
+        """Return reduced masks with their cameras, without duplicates.
+
+        `most`: largest number, evenly spaced; None: all.
+        """
         return [
             small_silhouette(Silhouette(
                 self.masks[k], self.shots[k].camera, self.outline(k), self.valid[k],
@@ -273,12 +285,12 @@ class Capture:
 
     @property
     def views(self) -> list[MaskedCamera]:
-        """The camera of each photograph with its valid pixels."""
+        """The camera of each photograph, paired with the mask of valid pixels."""
         return views_of(self.shots, self.valid)
 
     @property
     def hull(self) -> Hull | None:
-        """The visual hull of the masks; None without masks, or if all of them are from one side."""
+        """Visual hull of the masks. None if there are no masks, or if all are from one side."""
         index, wrong = self._outlined(MAX_MASKS), 0.02 if self.whole else 0.25
         key = wrong, *((self.masks.readers[k], self.valid.readers[k], self.shots[k].camera.key) for k in index)
         if key not in self.hulls:
@@ -290,15 +302,18 @@ class Capture:
 
     @property
     def whole(self) -> bool:
-        """Do masks contain the whole object? Masks by brightness do not: they lack its shadowed part."""
+        """Test whether the masks contain the whole object. Masks by brightness do not: they lack its shadowed part."""
         return self.threshold is None or (self.photographs.colocated and not self.photographs.dark)
 
     def outline(self, k: int) -> str:
-        """The name of the file with the mask of photograph `k`, for messages."""
+        """Return the name of the file that contains the mask of photograph `k`, for messages."""
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
-        """Centre (3,) and radius of the normalising sphere [scene units], from the XML, the masks or the cameras."""
+        """Return (centre (3,), radius) of the normalising sphere [scene units].
+
+        They are given in the XML or estimated.
+        """
         center, radius = self.shape.center, self.shape.radius
         if center is None or radius is None:
             if self.hull:
@@ -321,10 +336,10 @@ def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
 
 
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
-    """Estimate a sphere around the object from the cameras alone: centre (3,) and radius [scene units].
+    """Estimate a sphere around the object from the cameras alone. Returns (centre (3,), radius) [scene units].
 
-    The centre is the point nearest to all optical axes, the radius half that of the ball there that all photographs
-    contain.
+    The centre is the point nearest to all optical axes. The radius is half that of the largest ball around it that all
+    photographs contain.
     """
     cameras = [shot.whole.camera for shot in capture.shots]
     origins = np.stack([camera.position for camera in cameras])

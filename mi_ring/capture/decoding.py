@@ -14,24 +14,24 @@ from mi_ring.scene.shot import Encoding, Shot
 
 
 class LinearImage(NamedTuple):
-    """A photograph whose pixels are decoded to linear radiance already."""
+    """A photograph that is already decoded to linear radiance."""
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance, float16 or float32
     clipped: np.ndarray  #: (H, W, 3) bool
 
     @property
     def nbytes(self) -> int:
-        """The number of bytes of radiance and clipped pixels together."""
+        """Number of bytes that radiance and clipped pixels need together."""
         return self.rgb.nbytes + self.clipped.nbytes
 
 
 def decode(
     image: np.ndarray | LinearImage, linear: bool, saturation: float, gamma: float = 1.0, contrast: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Decode pixels to linear radiance (float32) and clipped pixels (bool), both in the shape of `image`.
+    """Decode pixels. Returns (linear radiance, float32; clipped pixels, bool), both in the shape of `image`.
 
-    `linear`: are the pixels linear, not sRGB? `saturation`: encoded value from which a pixel is clipped. `gamma` and
-    `contrast`: of the camera's `Response`, which is inverted. A `LinearImage` is returned as it is.
+    `linear`: are the encoded pixels linear, not sRGB? `saturation`: encoded value from which a pixel is clipped.
+    `gamma`, `contrast`: the camera's `Response`, which is inverted. A `LinearImage` is returned as it is.
     """
     if isinstance(image, LinearImage):
         return image.rgb.astype(np.float32), image.clipped
@@ -49,7 +49,7 @@ def decode(
 
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
-    """Vignetting times gain of a photograph `scale` times smaller, (H, W, 3) or (3,); 1 if it has neither."""
+    """Vignetting times gain at 1 / `scale` of the photograph's size: (H, W, 3), (3,) without vignetting, or 1.0."""
     gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
     if not shot.response.vignetting:
         return gain
@@ -58,7 +58,7 @@ def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
 
 
 def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
-    """Linear values that the camera of a photograph, `scale` times smaller, records for radiance (H, W, 3)."""
+    """Convert radiance (H, W, 3) to the linear values that the camera records, at 1 / `scale` of the shot's size."""
     curved = (radiance * shade(shot, scale)) ** shot.response.gamma
     return curved if shot.response.contrast == 1 else contrasted(curved, shot.response.contrast)
 
@@ -66,8 +66,8 @@ def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
 def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
     """Read encoded pixels (H, W, C) of an image file: uint8, uint16 or float32.
 
-    `field` and `scene` name the file's entry in the scene file for messages. Raises InputError as `require_header`
-    does, and if the pixels are damaged, infinite, NaN or too large.
+    `field`: name of the file's entry in the scene file `scene`, for messages. Raises InputError as `require_header`
+    does, and if pixels are damaged, infinite, NaN or too large.
     """
     require_header(path, field, shot, scene)
     what = f'photograph "{shot.name}", {field}'
@@ -79,7 +79,10 @@ def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
 
 
 def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
-    """Raise InputError if a file is missing, no image, or not as large as the film of its photograph."""
+    """Raise InputError if a file is missing or no image, or if its size is not that of the photograph's film.
+
+    `field`: name of the file's entry in the scene file `scene`.
+    """
     what = f'photograph "{shot.name}", {field}'
     if not is_file(path):
         raise InputError(f"{scene}: {what}: no such file: {path}")
@@ -91,7 +94,7 @@ def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
 
 
 def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
-    """Read encoded pixels (H, W, 3) of a photograph. An `ambient` file is subtracted; the result is then float32."""
+    """Read encoded pixels (H, W, 3) of a photograph. If it has an `ambient` image, that is subtracted: float32."""
     image = read_colours(shot, "filename", scene)
     if not shot.files.ambient:
         return image
@@ -108,7 +111,10 @@ def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
 
 
 def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Read encoded pixels (H, W, 3) of a photograph's file. Grey is repeated; transparent pixels become black."""
+    """Read encoded pixels (H, W, 3) of the image file in this `field`.
+
+    Grey is repeated; transparent pixels become black.
+    """
     file = getattr(shot.files, field)
     pixels = read_pixels(file, field, shot, scene)
     if shot.encoding == "linear" and pixels.dtype == np.uint8:
@@ -125,14 +131,17 @@ def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
 
 
 def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
-    """Are encoded pixels linear radiance? With encoding `auto`, all but those of 8 bits are."""
+    """Test whether encoded pixels are linear radiance. For the encoding `auto` they are, unless they have 8 bits."""
     if isinstance(pixels, LinearImage):
         return True
     return encoding == "linear" or (encoding == "auto" and pixels.dtype != np.uint8)
 
 
 def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Read the mask (H, W) uint8 in the file of a `field`: its alpha channel if that is the photograph itself."""
+    """Read the mask (H, W) uint8 from the file in this `field`.
+
+    If that is the photograph itself, take the alpha channel.
+    """
     file, itself = getattr(shot.files, field), getattr(shot.files, field) == shot.files.filename
     pixels = read_pixels(file, field, shot, scene)
     if itself and pixels.shape[2] not in (2, 4):

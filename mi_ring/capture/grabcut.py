@@ -5,22 +5,26 @@ import numpy as np
 
 
 def disk(radius: float) -> np.ndarray:
-    """Make a disk of this radius [px], at least 1, as a structuring element."""
+    """Make a structuring element: a disk of this radius [px], at least 1."""
     r = max(1, round(radius))
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
 
 
 def dilate_by_share(coverage: np.ndarray, share: float) -> np.ndarray:
-    """Dilate a mask (H, W) uint8, 0 or 1, by `share` times the square root of its area; a negative share erodes it."""
+    """Dilate a mask (H, W) uint8, 0 or 1, by `share` times the square root of the mask's area.
+
+    Negative shares erode it.
+    """
     kernel = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
     return cv2.dilate(coverage, kernel) if share > 0 else cv2.erode(coverage, kernel)
 
 
 def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band: float) -> np.ndarray:
-    """Segment the object in a photograph (H, W, 3) uint8 sRGB: (H, W) uint8, 1 on the object.
+    """Segment the object in a photograph (H, W, 3) uint8 sRGB. Returns a mask (H, W) uint8, 1 on the object.
 
-    `coverage` (H, W) uint8, 0 or 1: its approximate mask. `background` (H, W) bool: surely not the object. GrabCut
-    decides in a band: `band` inside the outline, and 1.5 times as far outside [square root of the mask's area].
+    `coverage` (H, W) uint8, 0 or 1: approximate mask. `background` (H, W) bool: certainly not the object. GrabCut
+    decides only near the outline: up to `band` inside and 1.5 times as far outside, relative to the square root of the
+    mask's area.
     """
     seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
     seed[dilate_by_share(coverage, 1.5 * band) > 0] = cv2.GC_PR_BGD

@@ -33,12 +33,12 @@ MANY = 2**28  #: if photographs have more pixels in total, at first only their h
 def load_capture(
     path: str | Path, images: bool = True, masks: str = "given", width: int | None = None, crop: bool = True
 ) -> Capture:
-    """Read a scene file of photographs. Raises InputError for anything that cannot be fitted.
+    """Read a scene file with photographs. Raises InputError for anything that cannot be fitted.
 
     `images`: if False, read only cameras and lights, to render. `masks`: "given": those of the scene; "auto": the same,
-    but by brightness if there are none and the room was dark; "none": by brightness, those of the scene are ignored.
-    `width`: reduce photographs to at most this width [px] and, if `crop`, to the object, by `reduced`. Default: keep
-    them as they are.
+    but by brightness if there are none and the room was dark; "none": by brightness, the scene's masks are ignored.
+    `width`: reduce photographs to at most this width [px] and, if `crop`, to the object; see `reduced`. Default: as
+    they are.
     """
     path = Path(path)
     if masks not in ("given", "auto", "none"):
@@ -86,20 +86,26 @@ def load_capture(
 
 
 def require_headers(shot: Shot, scene: Path, masks: str) -> None:
-    """Raise InputError if a header among a photograph's files is wrong. `masks`: as for `load_capture`."""
+    """Raise InputError if the header of one of the photograph's files is wrong. `masks`: as for `load_capture`."""
     for field, file in shot.files._asdict().items():
         if file and (field != "mask" or masks != "none"):
             require_header(file, field, shot, scene)
 
 
 def require_capture(path: Path, masks: str) -> None:
-    """Check a scene file and the headers of its images; raises InputError. `masks`: as for `load_capture`."""
+    """Check a scene file and the headers of the images. Raises InputError if one is invalid.
+
+    `masks`: as for `load_capture`.
+    """
     for shot in load_capture(path, images=False).shots:
         require_headers(shot, path, masks)
 
 
 def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
-    """Read on demand the masks (H, W) in this `field` of photographs. Equal files share their pixels."""
+    """Return the masks (H, W) in this `field` of the photographs; each is read when it is used.
+
+    Photographs with the same mask file share the array.
+    """
     readers: dict[tuple, Reader] = {}
 
     def reader(shot: Shot) -> Reader | None:
@@ -111,7 +117,7 @@ def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
 
 
 def require_scene(path: Path) -> None:
-    """Raise InputError if a path is not a scene file, but a photograph or no file. The message says what to give."""
+    """Raise InputError, with advice what to give instead, if `path` does not exist or is a photograph."""
     photographs = path.is_dir() or path.suffix.lower() in SUFFIXES
     usual = "the XML file of a scene" + ("; mi-ring photos makes one of a folder of photographs" * photographs)
     inside = path / "scene.xml"
@@ -141,12 +147,12 @@ def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
 
 
 def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
-    """The `photograph` sensors of a scene."""
+    """Return the `photograph` sensors of a scene."""
     return [sensor for sensor in scene.sensors() if isinstance(sensor, photograph.Photograph)]
 
 
 def require_xml(path: Path) -> None:
-    """Raise InputError for invalid XML, and for a missing pose, which Mitsuba would silently place at the origin."""
+    """Raise InputError if the XML is invalid or a sensor lacks its pose, which Mitsuba would place at the origin."""
     content = path.read_bytes()
     content.decode("utf-8")
     try:
@@ -165,13 +171,13 @@ def require_xml(path: Path) -> None:
 
 
 def load_views(path: Path) -> list[MaskedCamera]:
-    """Read the cameras of a scene file with their valid pixels. Raises InputError if it cannot be read."""
+    """Read the cameras of a scene file, each with the mask of valid pixels. Raises InputError if reading fails."""
     _, shots = open_scene(path)
     return views_of(shots, masks_of(shots, "valid", path))
 
 
 def recompute_normals(scene: mi.Scene) -> None:
-    """Recompute the vertex normals of meshes whose files have none, so that they are the same in each process."""
+    """Recompute vertex normals of meshes whose files have none, so that all processes get the same normals."""
     for shape in scene.shapes():
         if not shape.is_mesh() or not shape.has_vertex_normals():
             continue
@@ -184,7 +190,7 @@ def recompute_normals(scene: mi.Scene) -> None:
 
 
 def reason(error: RuntimeError) -> str:
-    """The message of an error of Mitsuba's parser, in one line."""
+    """Return the message of a Mitsuba parser error in one line."""
     text = str(error).split("] ", 1)[-1]
     if "Traceback" in text:  # of one of our plugins: the message follows the name of the exception
         text = text.split("Error: ", 1)[-1]

@@ -16,7 +16,7 @@ REMEMBERED_PIXELS = 2**24
 
 
 class Observation(NamedTuple):
-    """The pixels of n photographs of one size, as a fit compares them: radiance, clipped pixels, masks."""
+    """The pixels of n photographs of one size, with which a fit compares: radiance, clipped pixels, masks."""
 
     rgb: Tensor  #: (n, H, W, 3) linear radiance, 1.0 = full scale of the file
     clipped: Tensor  #: (n, H, W, 3) bool: the true radiance is at least this
@@ -25,7 +25,7 @@ class Observation(NamedTuple):
     valid: Tensor | None  #: (n, H, W) bool; invalid pixels are black and clipped. None: all are valid
 
     def surely(self, coverage: Tensor) -> Tensor:
-        """Find pixels that only show the object, (n, H, W) bool, by the mask, if there is one, and by a `coverage`."""
+        """Find pixels (n, H, W) bool that show only the object, by `coverage` (n, H, W) and the mask, if there is one."""
         mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
         return torch.minimum(mask, coverage) > 0.99
 
@@ -35,7 +35,7 @@ class Observation(NamedTuple):
 
     @classmethod
     def joined(cls, several: Sequence["Observation"]) -> "Observation":
-        """Join several observations of one size to one."""
+        """Join several observations of one size into one."""
         *parts, valid = zip(*several)
         rgb, clipped, mask, masked = map(torch.cat, parts)
         if all(v is None for v in valid):
@@ -47,7 +47,7 @@ class Observation(NamedTuple):
 def observed(
     shot: Shot, image: np.ndarray | LinearImage, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
 ) -> Observation:
-    """Make the observation of one photograph from its encoded pixels (H, W, 3), box-filtered `scale` times smaller.
+    """Make the observation of one photograph: decode pixels (H, W, 3), and reduce them `scale` times by a box filter.
 
     `mask`, `valid`: (H, W) uint8 as in the files; None if the photograph has none.
     """
@@ -71,13 +71,16 @@ def observed(
 
 
 class ObservationCache:
-    """Keeps observations of single photographs at the scale last used, up to `REMEMBERED_PIXELS`; none at scale 1."""
+    """Caches observations of single photographs, of the last used scale only, up to `REMEMBERED_PIXELS`.
+
+    At scale 1, nothing is cached.
+    """
 
     def __init__(self) -> None:
         self.kept: dict[int, tuple[int, Observation]] = {}  # scale and observation by index
 
     def get(self, k: int, scale: int, observe: Callable[[], Observation]) -> Observation:
-        """Return the observation of photograph `k` at a scale. If it is not kept, `observe` makes it."""
+        """Return the observation of photograph `k` at this scale. Calls `observe` if it is not in the cache."""
         if k in self.kept and self.kept[k][0] == scale:
             return self.kept[k][1]
         self.kept.pop(k, None)

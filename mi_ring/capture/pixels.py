@@ -12,10 +12,10 @@ Reader = Callable[[], np.ndarray]
 
 
 class Pixels(Sequence):
-    """A sequence of arrays, each read by its reader when it is needed; None where there is no reader.
+    """A sequence of arrays. Each is read by its reader when it is used; None where there is no reader.
 
-    Equal readers share one array, and parts share the cache. The cache keeps the arrays that are read first: a fit
-    draws photographs at random, so that no other rule is better.
+    Equal readers share one array. Parts of a sequence share the cache, which keeps the arrays read first: a fit draws
+    photographs at random, so no other rule is better.
     """
 
     def __init__(self, readers: Iterable[Reader | None] = (), kept: dict[Reader, np.ndarray] | None = None) -> None:
@@ -25,7 +25,7 @@ class Pixels(Sequence):
 
     @classmethod
     def of(cls, arrays: Iterable[np.ndarray | None]) -> "Pixels":
-        """Make a sequence of arrays that are in memory."""
+        """Make a sequence from arrays in memory."""
         return cls(None if array is None else partial(np.asarray, array) for array in arrays)
 
     def __len__(self) -> int:
@@ -44,15 +44,15 @@ class Pixels(Sequence):
 
     @property
     def given(self) -> list[bool]:
-        """Which indices have a reader."""
+        """For each index: is there a reader?"""
         return [reader is not None for reader in self.readers]
 
     def part(self, index: Iterable[int]) -> "Pixels":
-        """The sequence of the arrays with these indices alone."""
+        """Return the subsequence with these indices."""
         return Pixels([self.readers[k] for k in index], self.kept)
 
     def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":
-        """The same sequence with other readers at some indices."""
+        """Return a copy of the sequence with other readers at the indices in `readers`."""
         several = [readers.get(k, reader) for k, reader in enumerate(self.readers)]
         left = {*several}
         return Pixels(several, {reader: array for reader, array in self.kept.items() if reader in left})

@@ -40,11 +40,11 @@ MORE = np.array([[-1], [1]])  #: bounds found in a reduced mask are widened by o
 
 
 def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, crop: bool = True) -> Capture:
-    """Reduce the photographs of a capture to at most this `width` [px], and crop them to the object where that helps.
+    """Reduce the photographs of a capture to at most `width` [px], and crop them to the object where that helps.
 
-    `by_brightness`: masks are found by brightness, as `with_masks_by_brightness` does. Without `crop` photographs are
-    only made smaller. Photographs that are small stay as they are. So do those of a capture that was reduced before,
-    whatever its width is. Raises InputError like `load_capture`.
+    `by_brightness`: find masks as `with_masks_by_brightness` does. Without `crop`, only reduce. Small photographs stay
+    as they are; so do all photographs of a capture that was reduced before, to whatever width. Raises InputError like
+    `load_capture`.
     """
     small = all(shot.size[0] <= SMALL and reduction_factor(shot.size, width) == 1 for shot in capture.shots)
     if any(shot.window for shot in capture.shots) or not capture.images or small:
@@ -69,12 +69,18 @@ def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, c
 
 
 def reduction_factor(size: tuple[int, ...], width: int) -> float:
-    """By which factor an image (width, height) [px] must be reduced to be at most `width` [px] wide; at least 1."""
+    """Factor, at least 1, by which an image must shrink to be at most `width` [px] wide.
+
+    `size`: (width, height) [px].
+    """
     return max(1.0, size[0] / width, size[1] / (HIGHEST * width))
 
 
 def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], width: int) -> Window:
-    """Make the window of a photograph of size `whole` from `low` on, reduced to at most this `width` [px]."""
+    """Make the window with corner `low` (2,) and size `extent` (2,) [px], reduced to at most `width` [px].
+
+    `whole`: (width, height) [px] of the photograph.
+    """
     scale = reduction_factor(tuple(extent), width)
     blocks = int(scale)  # the first step of the reduction averages squares of so many pixels
     extent = [blocks * (side // blocks) for side in extent]
@@ -86,8 +92,8 @@ def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], widt
 def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], width: int) -> list[Window]:
     """Choose a window around the object in each photograph, reduced to at most `width` [px].
 
-    `bounds`: lowest and highest corner (2, 2) [px] of each mask, None without one. Photographs of one size get windows
-    of one size, so that they are rendered together. They are not cropped if one of them has no mask.
+    `bounds`: for each mask the lowest and highest corner (2, 2) [px], or None without a mask. Photographs of one size
+    get windows of one size, to be rendered together. If one of these has no mask, none of them is cropped.
     """
     windows = []
     sizes = [shot.size for shot in shots]
@@ -104,9 +110,9 @@ def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], wid
 
 
 def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
-    """Find the lowest and the highest corner (2, 2) [px] of each mask; None without one, or if it is empty.
+    """Find the lowest and highest corner (2, 2) [px] of the object in each mask. None without a mask or if it is empty.
 
-    Those of `large` masks are kept in the cache folder.
+    `large`: are masks large? Their corners are then kept in the cache folder.
     """
     several = {reader: k for k, reader in enumerate(capture.masks.readers) if reader}  # some may share a mask
 
@@ -134,7 +140,10 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
 
 
 def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
-    """Look at a capture through these windows of its photographs. Photographs in files are read at once."""
+    """Return a capture in which each photograph shows only its window. Photographs in files are read now.
+
+    `doing`: label of the progress bar.
+    """
     shots = tuple(shot.through(window) for shot, window in zip(capture.shots, windows))
 
     def parts(k: int) -> dict[str, Callable[[], Any]]:
@@ -174,7 +183,10 @@ def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
 
 
 def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[int], doing: str) -> list[Any]:
-    """Call a function that decodes a photograph for each of these, in as many threads as memory allows."""
+    """Call `function(k)`, which decodes a photograph, for each `index`, in as many threads as memory allows.
+
+    Returns the results in order. `doing`: label of the progress bar.
+    """
 
     def memory(shot: Shot) -> int:
         file = shot.files.filename
@@ -187,9 +199,9 @@ def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[in
 
 
 def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
-    """Decode a photograph to linear radiance, cut the window out and scale it down to the window's size.
+    """Decode a photograph to linear radiance, crop it to the window and resize it to the window's size.
 
-    It works in strips, to save memory. Returns float16 for a photograph of 8 bits, otherwise float32.
+    Works in strips to save memory. Returns float16 for a photograph of 8 bits, otherwise float32.
     """
     image = read()
     radiance, clipped = [], []
@@ -217,26 +229,26 @@ def reduced_valid(read: Reader, window: Window) -> np.ndarray:
 
 
 def means(mask: np.ndarray, window: Window) -> np.ndarray:
-    """Average a mask (H, W) to a window."""
+    """Reduce a mask (H, W) to a window by area means."""
     (left, top), (width, height) = window.corner, window.extent
     part = mask[top : top + height, left : left + width, None]
     return resized(averaged(part, window.blocks), window)[..., 0]
 
 
 def averaged(pixels: np.ndarray, blocks: int) -> np.ndarray:
-    """Average squares of so many pixels (H, W, C); float32."""
+    """Average blocks of `blocks` × `blocks` pixels of an image (H, W, C): float32."""
     return box_filter(torch.from_numpy(np.ascontiguousarray(pixels, np.float32)), blocks).numpy()
 
 
 def resized(pixels: np.ndarray, window: Window) -> np.ndarray:
-    """Average areas of an image (H, W, C), so that it has the size of a window."""
+    """Resize an image (H, W, C) to the size of a window by area means."""
     if pixels.shape[1::-1] == window.size:
         return pixels
     return cv2.resize(pixels, window.size, interpolation=cv2.INTER_AREA).reshape(*window.size[::-1], -1)
 
 
 def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
-    """Extend a mask (h, w) uint8 in a window to the whole photograph (H, W); nothing is outside the window."""
+    """Paste the mask (h, w) uint8 of a window into one of the whole photograph (H, W), 0 outside the window."""
     if window is None:
         return mask
     (left, top), (width, height) = window.corner, window.extent
@@ -246,7 +258,10 @@ def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
 
 
 def source(read: Reader | None) -> tuple | None:
-    """What a reader of `mi_ring.capture.decoding` reads: its name, field, and digests of files. None for any other."""
+    """Describe what a reader of `mi_ring.capture.decoding` reads: its name, the field, digests of the files.
+
+    None for any other reader.
+    """
     if not isinstance(read, partial) or read.func not in (read_photograph, read_mask):
         return None
     shot, *field = read.args[:-1]
@@ -255,12 +270,12 @@ def source(read: Reader | None) -> tuple | None:
 
 
 def key_of(*parts: Any) -> str:
-    """Make the cache's key of what is made of these parts."""
+    """Hash `parts`, from which something is computed, to its key in the cache."""
     return hashlib.blake2b(repr((FORMAT, *parts)).encode(), digest_size=16).hexdigest()
 
 
 def packed(arrays: dict[str, Any]) -> memoryview:
-    """Make the cache's file of a reduced photograph and its masks."""
+    """Serialise a reduced photograph and its masks for the cache."""
     image = arrays["images"]
     content = arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped)}
     buffer = io.BytesIO()
@@ -269,7 +284,7 @@ def packed(arrays: dict[str, Any]) -> memoryview:
 
 
 def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | LinearImage:
-    """Read a reduced photograph or mask from the cache's file with this key; if that is gone or damaged, `make` it."""
+    """Read the array `name` from the cache entry `key`. If the entry is missing or damaged, call `make` instead."""
     path = cache.cached(key)
     try:
         with np.load(path or "") as file:

@@ -14,11 +14,11 @@ from mi_ring.scene.xml_elements import load_bsdf
 
 
 def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
-    """Choose the BSDF parameters that BRDF-Net predicts. Returns them, and as XML the BSDF that reads them.
+    """Choose the BSDF parameters that BRDF-Net predicts. Returns (parameters, XML of the BSDF that reads them).
 
-    `ranges`: lowest and highest value by the parameter's name in the BSDF's documentation; infinity if there is no
-    highest value. Empty: the parameters of `cooktorrance` that are no constants. Raises InputError for parameters that
-    the BSDF does not have; the message names those that it has.
+    `ranges`: (lowest, highest) value by the parameter's name in the BSDF's documentation; infinity: no highest value.
+    Empty: all parameters of `cooktorrance` that are not constant. Raises InputError for parameters that the BSDF does
+    not have; the message lists those that exist.
     """
     scene, bsdf = capture.path, capture.shape.bsdf()
     element = bsdf_element(ElementTree.fromstring(capture.xml), scene)[1]
@@ -72,7 +72,10 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:
-    """The output with which BRDF-Net predicts the mean of `value` between `low` and `high`; 0 if `high` is infinite."""
+    """Network output for which BRDF-Net predicts the mean of `value` in the range from `low` to `high`.
+
+    It is 0 if `high` is infinite.
+    """
     if math.isinf(high):
         return 0.0
     share = (float(value.mean()) - low) / (high - low)

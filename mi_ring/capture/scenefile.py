@@ -33,7 +33,7 @@ REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *OPTIONAL}
 
 
 def photograph_element(shot: Shot) -> Element:
-    """Write a whole photograph as XML. The shot's file names must be relative to the scene file."""
+    """Make the XML of a photograph. The shot's file names must be relative to the scene file."""
     shot = shot.whole
     element = ElementTree.Element("sensor", type="photograph", id=shot.name)
     for field, file in shot.files._asdict().items():
@@ -65,11 +65,10 @@ def scene_element(
     photographs: Iterable[Element] = (), center: np.ndarray | None = None, radius: float | None = None,
     ground: np.ndarray | None = None, up: np.ndarray | None = None, metres: float | None = None, fresnel: bool = False,
 ) -> Element:  # fmt: skip
-    """Write a scene of photographs to fit as XML, with `photometric` and a `shapenet` with `cooktorrance`.
+    """Make the XML of a scene of photographs, with `photometric` and a `shapenet` with `cooktorrance`.
 
-    `center` (3,), `radius`: of the normalising sphere [scene units]; `ground` (3,): a point on the table; `up` (3,):
-    the table's normal, or the up direction; `metres`: length of a scene unit [m]; None if unknown. `fresnel`: of
-    `cooktorrance`.
+    `center` (3,), `radius`: normalising sphere [scene units]. `ground` (3,): a point on the table. `up` (3,): normal of
+    the table, or up direction. `metres`: length of a scene unit [m]; None: unknown. `fresnel`: with the Fresnel term?
     """
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
@@ -89,7 +88,10 @@ def scene_element(
 
 
 def table_element(picture: str, square: np.ndarray) -> Element:
-    """Write a diffuse `table` as XML. `picture`: file of its albedo; `square` (4, 4): its to_world."""
+    """Make the XML of a diffuse `table`. `picture`: image file of the albedo.
+
+    `square` (4, 4): transform of the square.
+    """
     element = ElementTree.Element("shape", type="table")
     add_pose(element, square)
     bsdf = ElementTree.SubElement(element, "bsdf", type="diffuse")
@@ -100,13 +102,13 @@ def table_element(picture: str, square: np.ndarray) -> Element:
 
 
 def scene_bytes(root: Element) -> bytes:
-    """Convert the XML of a scene to the content of its file."""
+    """Serialise the XML of a scene to the content of a file."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, "utf-8")
 
 
 def emitter_element(light: Light) -> Element:
-    """Write a light as XML: `point` or `directional`."""
+    """Make the XML of a light: `point` or `directional`."""
     emitter = ElementTree.Element("emitter", type=light.kind)
     tag, where, strength = {
         "point": ("point", "position", "intensity"), "directional": ("vector", "direction", "irradiance")
@@ -118,9 +120,10 @@ def emitter_element(light: Light) -> Element:
 
 
 def perspective_element(camera: Camera, points: np.ndarray) -> Element:
-    """Write a camera without its distortion as Mitsuba's `perspective`. The clipping planes enclose `points` (n, 3).
+    """Make the XML of a camera as Mitsuba's `perspective`, without lens distortion.
 
-    Its pixels are square: if those of the camera are not, the number of rows is changed.
+    The clipping planes enclose `points` (n, 3). Mitsuba's pixels are square: if the camera's are not, the number of
+    rows is changed.
     """
     (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
     distance = np.linalg.norm(points - camera.position, axis=1)
@@ -139,20 +142,20 @@ def perspective_element(camera: Camera, points: np.ndarray) -> Element:
 
 
 def add_pose(element: Element, to_world: np.ndarray) -> None:
-    """Add `to_world` (4, 4) to a sensor or shape."""
+    """Add the transform `to_world` (4, 4) to the XML of a sensor or shape."""
     transform = ElementTree.SubElement(element, "transform", name="to_world")
     ElementTree.SubElement(transform, "matrix", value=numbers(to_world))
 
 
 def add_film(sensor: Element, width: int, height: int) -> None:
-    """Add a film of this size [px] to a sensor."""
+    """Add a film of this size [px] to the XML of a sensor."""
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
     for name, pixels in (("width", width), ("height", height)):
         ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
 
 
 def numbers(values: ArrayLike) -> str:
-    """Write numbers as text for XML."""
+    """Format numbers as text for XML."""
     return " ".join(f"{v:.9g}" for v in np.ravel(values))
 
 
@@ -162,9 +165,9 @@ def recalibrated_xml(
 ) -> bytes:  # fmt: skip
     """Rewrite a scene file with the cameras, lights and responses of `shots`, matched by id, else by order.
 
-    `room`: light of the room, see `mi_ring.rendering.spherical_harmonics`; `frames`: axes ("world", "camera") in which
-    a `room` is written even if it is black, by default those of the file's rooms; `lamps`: point and directional lights
-    of all photographs, by default those of the file.
+    `room` (BASIS, 3): room light. `frames`: axes ("world", "camera") in which a `room` is written even if it is black;
+    default: those of the rooms in the file. `lamps`: point and directional lights for all photographs; default: those
+    of the file.
     """
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
@@ -190,7 +193,7 @@ def recalibrated_xml(
 
 
 def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
-    """Rewrite a scene file with these photographs instead of its own."""
+    """Rewrite a scene file: its photographs are replaced by `shots`."""
     root = ElementTree.fromstring(scene)
     for element in root.findall("sensor[@type='photograph']"):
         root.remove(element)
@@ -199,7 +202,7 @@ def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
 
 
 def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) -> bytes:
-    """Rewrite a scene file of `shots` with new `masks`: files relative to it, by the photograph's index."""
+    """Rewrite a scene file of `shots` with new masks. `masks`: mask files, relative to it, by photograph index."""
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
         if k in masks:
@@ -210,9 +213,9 @@ def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) 
 
 
 def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, int]]:
-    """Find the photographs of a scene file: elements with their indices in `shots`, by name, else by order.
+    """Find the XML elements of photographs in a scene file. Returns (element, index in `shots`), by id, else by order.
 
-    Photographs that are not in `shots` are removed from `root`. Raises InputError if ids to find them are missing.
+    Photographs that are not in `shots` are removed from `root`. Raises InputError if ids are needed and missing.
     """
     elements = root.findall(".//sensor[@type='photograph']")
     named = {shot.name: k for k, shot in enumerate(shots)}
@@ -227,9 +230,9 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
 
 
 def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:
-    """Write the light of a room (BASIS, 3) as XML: the part fixed to the world and the part fixed to the camera.
+    """Make the XML of room light (BASIS, 3): one element for the part in world axes, one for the part in camera axes.
 
-    A black part is left out, unless `frames` contains "world" or "camera", respectively.
+    A black part is left out unless its axes, "world" or "camera", are in `frames`.
     """
     world, camera = room[:PER_FRAME], np.vstack([np.zeros_like(room[:1]), room[PER_FRAME:]])
     # Uniform light belongs to either part.
@@ -240,7 +243,10 @@ def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Elemen
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:
-    """Write a `room` as XML. `frame`: "world" or "camera"; `harmonics`: (PER_FRAME, 3) or fewer rows, in these axes."""
+    """Make the XML of a `room`. `frame`: "world" or "camera".
+
+    `harmonics`: (PER_FRAME, 3) or fewer rows, in these axes.
+    """
     orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
     harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
     element = ElementTree.Element("emitter", type="room")
@@ -250,7 +256,7 @@ def room_element(frame: str, harmonics: np.ndarray) -> Element:
 
 
 def move_names(root: Element, source: Path, folder: Path) -> None:
-    """Rewrite file names that are relative to the folder `source`, so that they are relative to `folder`."""
+    """Rewrite file names in a scene: those relative to the folder `source` become relative to `folder`."""
     for element in root.iter("string"):
         if element.get("name") not in FILES:
             continue
@@ -260,10 +266,10 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
 
 
 def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
-    """Rewrite the scene file `path` for `folder`, with the fitted object and its `bsdf` (XML).
+    """Rewrite the scene file `path` for the results folder `folder`, with the fitted object and its `bsdf` (XML).
 
-    File names become relative to `folder`. Raises InputError for a scene or a shapenet that cannot be rewritten or
-    fitted.
+    `subdivisions`: level of the mesh. File names become relative to `folder`. Raises InputError if the scene or the
+    `shapenet` cannot be rewritten or fitted.
     """
     root = ElementTree.parse(path).getroot()
     old_bsdf, _ = bsdf_element(root, path)
@@ -282,9 +288,9 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
 
 
 def bsdf_element(root: Element, path: Path) -> tuple[Element, Element]:
-    """Find in the XML of the scene file `path` the shapenet's <bsdf> or <ref>, and the <bsdf> that this means.
+    """Find the BSDF of the `shapenet` in a scene file. Returns (its <bsdf> or <ref>, the <bsdf> itself).
 
-    Raises InputError if there is none, or if a part of the scene is in another file.
+    Raises InputError, which names the file `path`, if there is none, or if a part of the scene is in another file.
     """
     for tag in ("include", "default", "path"):
         if root.find(f".//{tag}") is not None:

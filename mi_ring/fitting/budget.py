@@ -20,9 +20,10 @@ Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and wi
 
 
 def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = int) -> Costs:
-    """Measure the seconds of an iteration at each level and width of the stages, by the second of two iterations.
+    """Measure how many seconds an iteration takes at each mesh level and photograph width of the `stages`.
 
-    Another fit runs them, from the state of this one. Returns an empty dictionary if `interrupted`.
+    Runs two iterations of each in a trial fit and times the second. Returns seconds by (level, width), or {} if
+    `interrupted()` returns a signal.
     """
     print("Measuring how long iterations take, to say how long is left", flush=True)
     trial = Fit(fit.problem.given, fit.problem.config, terms=fit.loss.terms, state=fit.state())
@@ -46,18 +47,21 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
 
 
 def replan(fit: Fit, config: Config) -> None:
-    """Change stages, iterations, level or regulariser of a fit that has not begun."""
+    """Give new settings to a fit that has not begun: other stages, iterations, mesh level or regulariser."""
     fit.problem = fit.optimisation.problem = replace(fit.problem, config=config)
     fit.ring.subdivisions, fit.schedule = config.subdivisions, fit.plan(config)
 
 
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
-    """List the stages of fits with each of `configs`, from the start of this fit."""
+    """List the stages of all fits that use one of `configs` and begin like this fit."""
     return [stage for config in configs for stage in fit.plan(config).stages]
 
 
 def fitting_into(seconds: float, configs: Sequence[Settings], plan: Planner, costs: Costs) -> Settings:
-    """Choose the settings whose fit takes about `seconds`, with as many iterations as that time allows."""
+    """Choose the settings whose fit takes about `seconds`, and set their number of iterations to fill that time.
+
+    `plan` returns the schedule for settings; `costs`: seconds per iteration, from `measure`.
+    """
     config = min(configs, key=lambda config: abs(math.log(seconds_of(config, plan, costs) / seconds)))
     around = seconds_around(config, plan, costs)
     share = (seconds - around) / (seconds_of(config, plan, costs) - around)
@@ -65,17 +69,17 @@ def fitting_into(seconds: float, configs: Sequence[Settings], plan: Planner, cos
 
 
 def fewest_seconds(configs: Sequence[Config], plan: Planner, costs: Costs) -> float:
-    """Estimate the time [s] of the shortest useful fit with any of these settings."""
+    """Estimate the time [s] of the shortest useful fit among `configs`. Arguments: as for `fitting_into`."""
     return min(seconds_of(replace(config, iterations=FEWEST), plan, costs) for config in configs)
 
 
 def seconds_of(config: Config, plan: Planner, costs: Costs) -> float:
-    """Estimate the time [s] of a fit, with the pictures before it and its results."""
+    """Estimate the total time [s] of a fit: its iterations, the pictures before them, and writing the results."""
     iterations = sum((s.last - s.first) * costs[s.level, s.width] for s in plan(config).stages)
     return iterations + seconds_around(config, plan, costs)
 
 
 def seconds_around(config: Config, plan: Planner, costs: Costs) -> float:
-    """Estimate the time [s] of the pictures before a fit and of its results, which have the size of the last stage."""
+    """Estimate the time [s] of a fit outside its iterations: for the pictures before them and for the results."""
     last = plan(config).stages[-1]
     return AROUND * costs[last.level, last.width]

@@ -19,9 +19,10 @@ ADVICE = "run without --resume to start anew"
 
 
 def read_checkpoint(folder: Path, config: Config) -> dict:
-    """Read the checkpoint in a folder. If it is damaged, reads the one before and prints a line.
+    """Read the newest checkpoint in `folder`. If it is damaged or missing, read the previous one and print a message.
 
-    Raises InputError if there is none, or if it was made with other settings.
+    Returns the content of the checkpoint. Raises InputError if no checkpoint can be read, or if it was made with
+    settings other than `config`.
     """
     path = folder / NAME
     try:
@@ -57,13 +58,16 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
 
 
 def by_option(settings: dict) -> dict:
-    """Settings as on the command line: each weight is an entry of its own."""
+    """Convert settings to one entry per command-line option: each loss weight gets a key `weights.NAME`."""
     weights = {f"weights.{name}": value for name, value in settings["weights"].items()}
     return {name: value for name, value in settings.items() if name != "weights"} | weights
 
 
 def require_same_files(state: dict, capture: Capture, config: Config, folder: Path) -> None:
-    """Raise InputError if a file of the capture is not what it was when the checkpoint was made."""
+    """Raise InputError if a file that the fit reads has changed since the checkpoint with this `state` was written.
+
+    `folder`: the results folder, for the message.
+    """
     before, now = state["files"], digests(capture, config)
     for name in sorted(before.keys() | now.keys()):
         if before.get(name) != now.get(name):
@@ -72,9 +76,10 @@ def require_same_files(state: dict, capture: Capture, config: Config, folder: Pa
 
 
 def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
-    """Restore the fit from the `state` of a checkpoint, to continue it. `folder`: of the results, named in errors.
+    """Restore a fit from the `state` in a checkpoint, so that it can continue.
 
-    Raises InputError if the state holds no usable fit, or if a file of the capture has changed since.
+    `folder`: the results folder, for messages. Raises InputError if the state is not that of a fit, or if a file of the
+    capture has changed since.
     """
     require_same_files(state, capture, config, folder)
     try:
@@ -91,9 +96,9 @@ def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
 
 
 def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
-    """Write a checkpoint and keep the one before. `files`: `digests` of the capture's files.
+    """Write a checkpoint of `fit` into `folder`, and keep the previous one. `files`: what `digests` returned.
 
-    Raises InputError if it cannot be written.
+    Raises InputError if the checkpoint cannot be written.
     """
     state = {"format": FORMAT, "settings": fit.problem.config.settings(), "files": files, "fit": fit.state()}
     path = folder / NAME
@@ -104,7 +109,10 @@ def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
 
 
 def digests(capture: Capture, config: Config) -> dict[str, str]:
-    """Hashes of all files that a fit reads, except textures, by their name relative to the scene."""
+    """Hash every file that a fit reads, except textures.
+
+    Returns hashes by file name relative to the scene file's folder.
+    """
     files = {capture.path, capture.shape.domain_file}
     files |= {file for shot in capture.shots for file in shot.files}
     if isinstance(config.domain, tuple):

@@ -224,9 +224,10 @@ class Config(Ablation, Tuning, Common):
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "Config":
-        """Make the settings of a preset, `fast`, `default`, `fine` or `paper`, with some `changes`.
+        """Return the settings of the preset `name`: `fast`, `default`, `fine` or `paper`.
 
-        `weights` changes only the weights that it names. Raises InputError for a preset that does not exist.
+        `changes` replace single settings. A `weights` among the changes replaces only the weights that it names. Raises
+        InputError for an unknown preset.
         """
         if name not in PRESETS:
             raise InputError(f"preset: is {name}, must be one of {', '.join(PRESETS)}")
@@ -270,13 +271,13 @@ class Config(Ablation, Tuning, Common):
             raise InputError(f"{path}: {error}") from None
 
     def settings(self) -> dict:
-        """All settings as plain data."""
+        """Return all settings as a dictionary that can be written as JSON."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(Config)}
         return json.loads(json.dumps(values, default=str))
 
 
 def of_type(kind: Any, value: Any) -> Any:
-    """Convert a value of JSON to a setting of the type `kind`. Raises ValueError if that is impossible."""
+    """Convert `value`, read from JSON, to the type `kind` of a setting. Raises ValueError if that is impossible."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         for one in inner:
@@ -297,7 +298,7 @@ def of_type(kind: Any, value: Any) -> Any:
 
 
 def as_typed(value: Any) -> str:
-    """Write the value of a setting as on the command line, for messages."""
+    """Format the value of a setting as the user types it on the command line; for messages."""
     if isinstance(value, dict):
         value = [word for item in value.items() for word in item]
     if isinstance(value, (tuple, list)):

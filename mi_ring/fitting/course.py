@@ -12,7 +12,7 @@ LOG_EVERY = 5  #: iterations between entries of the log
 
 @dataclass
 class Course:
-    """How far a fit is, and what it has found on the way besides its model."""
+    """The progress of a fit: how many iterations are done, the log, and what the fit has measured so far."""
 
     iteration: int = 0  #: number of iterations that are done
     seconds: float = 0.0  #: time of these iterations, and of coarse fits before them
@@ -21,7 +21,10 @@ class Course:
     validation: dict[str, Any] = field(default_factory=dict)  #: on held-out photographs, when the fit is done
 
     def record(self, it: Iteration, learning_rate: float, regulariser: RegulariserStrength, last: bool) -> None:
-        """Add an entry to the log if it is due. Terms of the loss are unweighted."""
+        """Append an entry about the iteration `it` to the log, if one is due.
+
+        It holds the unweighted terms of the loss.
+        """
         if it.number % LOG_EVERY and not last:
             return
         self.log.append({

@@ -27,7 +27,7 @@ BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
 
 
 class Layout:
-    """The order in which the numbers of all unknowns stand in one vector of `count` numbers."""
+    """The order of all unknowns of a calibration in one parameter vector with `count` entries."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.first, self.count = calibration, {}, 0
@@ -36,7 +36,10 @@ class Layout:
             self.count += getattr(calibration, name).numel()
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
-        """List what photographs `index` (n,) depend on: name of unknown, component, positions (n,) in the vector."""
+        """List the unknowns that affect the photographs `index` (n,), as tuples (name, component, positions).
+
+        `positions` (n,): where the parameter vector holds this component for each photograph.
+        """
         result = []
         for name, unknown in self.calibration.unknowns.items():
             for row in unknown.rows(self.calibration.rig, index):
@@ -47,9 +50,10 @@ class Layout:
 
 @torch.no_grad()
 def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
-    """The standard deviation of each unknown, except the room's light, by name, in its own unit and shape.
+    """Compute the standard deviation of each unknown, except the room's light: arrays by the unknown's name.
 
-    `level`: of the mesh for which photographs are predicted. Returns nothing if no unknown is refined.
+    Each array has the shape and unit of the unknown. Empty if no unknown is refined. `level`: level of the mesh that is
+    rendered.
     """
     calibration = model.calibration
     assert calibration is not None
@@ -73,15 +77,16 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
 
 class Equations:
-    """Normal equations of least squares, to which photographs are added, and the variance of their errors."""
+    """Normal equations of least squares, to which photographs are added one by one, and the residuals' variance."""
 
     def __init__(self, count: int) -> None:
         self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
 
     def add(self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray) -> None:
-        """Add a photograph: its derivatives `slopes` (K, H, W, C) by the numbers at `places` (K,) in the vector.
+        """Add one photograph to the equations.
 
-        `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: pixels that count.
+        `slopes` (K, H, W, C): its derivatives with respect to the entries `places` (K,) of the parameter vector.
+        `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: pixels to use.
         """
         slopes = slopes[:, counted].flatten(1).double()
         np.add.at(self.matrix, np.ix_(places, places), (slopes @ slopes.T).numpy())
@@ -93,13 +98,13 @@ class Equations:
         self.pixels += channels * int(counted.sum())
 
     def information(self) -> np.ndarray:
-        """The information matrix (N, N): the inverse of the covariance by the photographs added so far."""
+        """Compute the Fisher information matrix (N, N) of the added photographs: the inverse of the covariance."""
         return self.matrix * (self.pixels / self.squares if self.squares else 0.0)
 
 
 @dataclass(frozen=True)
 class CovarianceGroup:
-    """Photographs `index` of one size, rendered `scale` times smaller by the current model."""
+    """The photographs `index`, all of one size, to be rendered from the current model at 1 / `scale` of that size."""
 
     problem: Problem
     calibration: Calibration
@@ -109,21 +114,25 @@ class CovarianceGroup:
     scale: int
 
     def photographs(self) -> Photographs:
-        """The photographs for the renderer, with current calibration, and the room's light if it is the only one."""
+        """Prepare the photographs for the renderer, with the current calibration.
+
+        They contain the room's light only if they have no lights of their own.
+        """
         calibration, photographs = self.calibration, self.problem.capture.selected(self.index, self.scale)
         calibration.relight(self.surface)
         room = calibration.room_harmonics().cpu().double().numpy() if photographs.dark else None
         return prediction.with_views(replace(photographs, room=room), calibration(self.scale).to(self.problem.device))
 
     def direct(self) -> tuple[Tensor, Tensor]:
-        """Predict radiance (n, H, W, 3) by direct light, and coverage (n, H, W)."""
+        """Render direct light. Returns linear radiance (n, H, W, 3) and coverage (n, H, W)."""
         shadows = self.problem.config.shadows and self.problem.capture.shadows
         return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict the radiance that is added to direct light: that of interreflection and that of the room's light.
+        """Render what is added to direct light.
 
-        Each is (n, H, W, 3), or zero if it is not used. `lit`, `coverage`: from `direct`.
+        Returns (interreflection, room light), each linear radiance (n, H, W, 3). Either is zero if the fit does not use
+        it. `lit`, `coverage`: what `direct` returned.
         """
         calibration, indirect = self.calibration, self.indirect
         bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
@@ -139,7 +148,10 @@ class CovarianceGroup:
 
 
 def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes: Equations) -> None:
-    """Compare predicted photographs with the real ones, and add errors and derivatives to both equations."""
+    """Compare the photographs in the group `at` with their predictions, and add them to the normal equations.
+
+    Colour errors are added to `colours`, coverage errors to `silhouettes`.
+    """
     problem, calibration, index = at.problem, at.calibration, at.index
     seen = problem.capture.observe(index, at.scale)
     lit, coverage = at.direct()

@@ -19,7 +19,7 @@ ENOUGH = 30  #: least number of compared pixels
 
 
 class ExposureSolver(torch.optim.Optimizer):
-    """Finds the power or gain of each photograph: `look` at an iteration, then `step`."""
+    """Estimates the unknown `power` or `gain` of each photograph. Call `look` with an iteration, then `step`."""
 
     rate = Rate(0.5, 0.1, START)  #: share of the measured difference by which an estimate moves
 
@@ -32,9 +32,9 @@ class ExposureSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def look(self, it: Iteration) -> None:
-        """Compare photographs with their prediction, in each colour, by the median over bright pixels of the object.
+        """Measure how much brighter each photograph is than predicted: the median log ratio in each colour channel.
 
-        The mean over the photographs is subtracted: the reflectance explains it.
+        Only bright pixels on the object count. The mean over photographs is subtracted, because the albedo explains it.
         """
         self.seen = []
         if it.progress < START:
@@ -59,7 +59,7 @@ class ExposureSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Move the estimates for the photographs of the last iteration. Nothing moves before refinement begins."""
+        """Update the estimates for the photographs of the last `look`. Does nothing before refinement begins."""
         (group,) = self.param_groups
         for k, brighter in self.seen:
             change = group["lr"] * (brighter / self.width - PULL * self.tensor[k])

@@ -126,18 +126,22 @@ class Fit(Renamed):
         return it
 
     def evaluate(self, batch: Batch, observation: Observation) -> tuple[Tensor, Iteration]:
-        """Compute the loss of a batch for the present model, with its graph. Changes nothing: a step may repeat it."""
+        """Compute the loss of a batch with the current model.
+
+        Returns the loss, with its autograd graph, and the iteration. Changes no state, so an optimiser may call it
+        several times in one step.
+        """
         it = Iteration(batch, observation, self.renderer.predict(self.problem, self.model, batch), self.context())
         return self.loss(it), it
 
     def context(self) -> Context:
-        """What terms of the loss and solvers may know at this iteration."""
+        """Collect what terms of the loss and solvers may read at this iteration, besides batch and prediction."""
         config, one_material = self.problem.config, self.problem.lighting.one_material_until > 0
         return Context(config, self.capture, self.model, self.schedule, self.problem.exposure, one_material,
                        self.regulariser.strength(config.velocity_decay), self.renderer.autocast)  # fmt: skip
 
     def refine_masks(self) -> None:
-        """Find the masks again, near the outline of the current surface."""
+        """Segment the object again near the outline of the current surface, and replace the masks of the capture."""
         parts = self.capture, self.problem.exposure, self.model, self.renderer, self.schedule.final_level
         self.course.masks |= self.problem.processes.on_first(lambda: find_masks(*parts))
         self.capture = with_masks(self.problem.capture, self.course.masks)
@@ -170,7 +174,7 @@ class Fit(Renamed):
         return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 
     def result(self) -> FitResult:
-        """Collect what the results are made of: `mi_ring.output` writes them."""
+        """Collect what `mi_ring.output` needs to write the results."""
         return result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
                          list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
 
@@ -182,7 +186,10 @@ class Fit(Renamed):
         results.save(Path(folder), self.result())
 
     def state(self) -> dict[str, Any]:
-        """Collect what another `Fit` of the same capture needs to continue, for `torch.save`."""
+        """Return the state of the fit, to be saved by `torch.save`.
+
+        `restore` continues from it in a `Fit` of the same capture.
+        """
         return copy.deepcopy({  # the next iteration changes it
             "ring": ring_state(self.ring, self.problem.config.settings()), "lighting": tuple(self.problem.lighting),
             "calibration": self.model.calibration and self.model.calibration.state_dict(),
@@ -190,7 +197,7 @@ class Fit(Renamed):
         })  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from the `state()` of a fit with the same ring and lighting."""
+        """Continue from `state`, which `state()` of a fit with the same networks and lighting returned."""
         if self.model.calibration:
             self.model.calibration.load_state_dict(state["calibration"])
         for name in PARTS:

@@ -19,9 +19,10 @@ Averages: TypeAlias = dict[int, tuple[int, Tensor]]
 
 
 def averaged(earlier: Averages, new: GlobalIllumination, batch: Batch) -> tuple[GlobalIllumination, Averages]:
-    """Average the interreflection of a batch with that of `earlier` iterations. Returns it and the new averages.
+    """Average the interreflection in the photographs of a batch over this and `earlier` iterations.
 
-    A picture that is not finite changes no average.
+    Returns (averaged interreflection of this process's photographs, updated averages by photograph). A rendering with
+    NaN or infinite pixels is left out.
     """
     shown, averages = [], {}
     pictures = batch.share.gathered(torch.cat([new.radiance, new.alpha[..., None]], -1))

@@ -18,7 +18,7 @@ from mi_ring.fitting.schedule import Schedule, Stage
 
 @dataclass(frozen=True)
 class Context:
-    """What terms of the loss and solvers may know besides batch, observation and prediction."""
+    """What terms of the loss and solvers may read, besides the batch, the observation and the prediction."""
 
     config: Config
     capture: Capture
@@ -32,7 +32,10 @@ class Context:
 
 @dataclass
 class Iteration(renamed.Renamed):
-    """What an iteration has drawn, observed and predicted. Do not keep it: its pictures use memory."""
+    """One iteration: its batch, the observed photographs, the prediction and the loss.
+
+    Do not keep it: it uses much memory.
+    """
 
     batch: Batch
     observation: Observation
@@ -60,20 +63,23 @@ class Iteration(renamed.Renamed):
         return self.batch.stage
 
     def object_pixels(self) -> Tensor:
-        """Pixels that show only the object, (n, H, W) bool, by prediction and mask (if there is one)."""
+        """Find pixels (n, H, W) bool that show only the object, by the prediction and, if there is one, the mask."""
         return self.observation.surely(self.prediction.coverage.detach())
 
     def counted(self) -> Tensor | None:
-        """Pixels whose colours count, (n, H, W) bool; None: all. In a lit room the background does not count."""
+        """Pixels (n, H, W) bool that the colour loss compares. None: all pixels.
+
+        In a lit room they are the object's pixels, because the background is bright there.
+        """
         return self.object_pixels() if self.context.capture.lit_room else None
 
     def outline_blur(self) -> float:
-        """Standard deviation [px] of the blur of silhouettes."""
+        """Standard deviation [px] of the Gaussian that blurs silhouettes in the mask loss."""
         return self.context.schedule.outline_blur(self.progress, self.batch.size[0] / self.batch.scale)
 
     @torch.no_grad()
     def unexplained(self) -> float:
-        """Sum of absolute errors on the object, as a share of its light; NaN if no light of it is seen."""
+        """Sum of absolute errors on the object, divided by the sum of observed radiance there; NaN if that is 0."""
         pixels = self.object_pixels()
         error = (self.prediction.rgb - self.observation.rgb)[pixels]
         error = torch.where(self.observation.clipped[pixels], error.clamp(max=0), error)

@@ -41,9 +41,9 @@ RECORDING = {unknown.option for unknown in UNKNOWNS.values() if unknown.changes 
 
 
 def choose_lighting(capture: Capture, config: Config) -> Lighting:
-    """Find the lighting that `Config.light` asks for. For unknown lights coarse fits run, which take minutes.
+    """Find the initial lighting that `Config.light` asks for. If lights are unknown, this runs coarse fits for minutes.
 
-    Raises InputError if nothing lights the object, and if capture and settings do not go together.
+    Raises InputError if nothing lights the object, or if the settings do not fit the capture.
     """
     if config.light == "capture":
         return Lighting.of(capture, config)
@@ -80,7 +80,7 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
 
 
 class CoarseFits:
-    """Coarse fits of a capture under different lights, each made once."""
+    """Runs coarse fits of a capture under candidate lightings, each at most once, and compares their errors."""
 
     def __init__(self, capture: Capture, config: Config) -> None:
         """Prepare coarse fits of a capture. `config`: of the fit for which the light is chosen."""
@@ -93,7 +93,10 @@ class CoarseFits:
         self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
     def error(self, lighting: Lighting) -> float:
-        """The mean error of a coarse fit under this lighting, which runs if it has not yet; infinite if it fails."""
+        """Return the mean error of the coarse fit under `lighting`; infinite if the fit fails.
+
+        Runs the fit if necessary.
+        """
         if lighting in self.errors:
             return self.errors[lighting]
         refine = refined_under(lighting, self.config)
@@ -120,11 +123,14 @@ class CoarseFits:
         return self.errors[lighting]
 
     def best(self, *lightings: Lighting) -> Lighting:
-        """Choose the lighting with the least error."""
+        """Return the lighting whose coarse fit has the smallest error."""
         return min(lightings, key=self.error)
 
     def lamps(self) -> Lighting:
-        """Find the fewest lamps that explain the photographs well enough, as near as the cameras or infinitely far."""
+        """Find the smallest number of lamps that explains the photographs well enough.
+
+        The lamps are either as far from the object as the cameras, or infinitely far.
+        """
         several = [self.brightest(count) for count in range(1, MOST + 1)]
         enough = FEWER * min(self.error(some) for some in several if self.are_apart(some))
         lamps = next(some for some in several if self.are_apart(some) and self.error(some) <= enough)
@@ -132,7 +138,10 @@ class CoarseFits:
         return self.best(lamps, distant) if self.are_apart(distant) else lamps
 
     def are_apart(self, lamps: Lighting) -> bool:
-        """Are the lamps that were found apart, seen from the object? Else two of them stand for one."""
+        """Test whether the estimated lamps are in different directions from the object.
+
+        If not, two of them model one lamp.
+        """
         self.error(lamps)
         if len(lamps.lamps) < 2:
             return True
@@ -143,7 +152,10 @@ class CoarseFits:
         return bool((cosines < math.cos(math.radians(APART))).all())
 
     def brightest(self, count: int, distant: bool = False) -> Lighting:
-        """Place `count` lamps in the brightest directions of the environment; their strength fits an albedo of 0.5."""
+        """Place `count` lamps in the brightest directions of the estimated environment, scaled for an albedo of 0.5.
+
+        `distant`: are the lamps infinitely far?
+        """
         self.error(Lighting("environment"))
         if self.environment is None:
             raise self.failures[0]
@@ -155,7 +167,10 @@ class CoarseFits:
         return Lighting("lamps", lamps, distant)
 
     def with_material(self, lighting: Lighting) -> Lighting:
-        """Change the lighting to start with one material, if that explains the photographs about as well."""
+        """Start with a uniform material under this lighting, if that explains the photographs about as well.
+
+        Returns the better one of the two lightings, with the lamps that the coarse fit has estimated.
+        """
         one = lighting._replace(one_material_until=1.0)
         if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):
             return self.found[lighting]
@@ -163,17 +178,20 @@ class CoarseFits:
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
-    """The options of `Config.refine` that a coarse fit refines: the recording, and the photographs' own lights."""
+    """List the options of `Config.refine` that a coarse fit under `lighting` refines.
+
+    They concern the camera response and the photographs' own lights.
+    """
     own = {*OWN_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
     return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDING, *own}) or ("none",)
 
 
 def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find lamps that light an object like an environment: directions (count, 3) and colours (count, 3).
+    """Approximate an environment by `count` distant lamps. Returns unit directions (count, 3) and colours (count, 3).
 
-    Colours are relative to the first lamp, taken to be white: the object could have its colour. `harmonics` (PER_FRAME,
-    3): of the environment. `certainty` (PER_FRAME,): information about each. Least squares with constant light: each
-    direction in turn moves to its best place, until none moves.
+    `harmonics` (PER_FRAME, 3): spherical harmonics of the environment. `certainty` (PER_FRAME,): information about
+    each. Colours are relative to the first lamp, which is white, because the object's colour is unknown. Least squares
+    with constant light; one direction after the other is moved to its optimum, until none moves.
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
     seen = shown * harmonics

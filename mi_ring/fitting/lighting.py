@@ -26,7 +26,7 @@ Lamp: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]  #: `vector` and `
 
 
 class Lighting(NamedTuple):
-    """The lights of the photographs at the start of a fit, see `mi_ring.choose_lighting`."""
+    """The initial lights of a fit, and assumptions about them; see `mi_ring.choose_lighting`."""
 
     kind: Kind  #: as `Config.light`, except "auto"
     lamps: tuple[Lamp, ...] = ()
@@ -35,9 +35,10 @@ class Lighting(NamedTuple):
 
     @classmethod
     def of(cls, capture: Capture, config: Config) -> "Lighting":
-        """Take the lights of the scene.
+        """Make the lighting from the lights in the scene file.
 
-        Raises InputError if it has none, or if the settings ask for unknown lights: coarse fits find those.
+        Raises InputError if the scene has no lights, or if the settings ask for unknown lights: `choose_lighting` finds
+        those.
         """
         require_compatible(capture, config)
         if config.light != "capture":
@@ -52,9 +53,9 @@ class Lighting(NamedTuple):
         return kind + " on one material" * (self.one_material_until > 0)
 
     def material_at(self, progress: float, material: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The material (V, …) of a fit at this progress: the mean over all vertices until `one_material_until`.
+        """Return the material (V, …) to render at this progress: before `one_material_until` the mean of all vertices.
 
-        Photographs hardly tell slow changes of albedo from slow changes of light. So the light explains both.
+        Photographs hardly distinguish slow changes of albedo from slow changes of light. So the light explains both.
         """
         if progress >= self.one_material_until:
             return material
@@ -62,7 +63,7 @@ class Lighting(NamedTuple):
 
 
 def require_compatible(capture: Capture, config: Config) -> None:
-    """Raise InputError if capture and settings do not go with `Config.light`."""
+    """Raise InputError if the capture, or another setting, contradicts the setting `Config.light`."""
     others, own = shared_emitters(capture.scene), OWN_LIGHTS & set(config.refine)
     if config.light == "capture":
         if own and capture.photographs.dark:
@@ -91,12 +92,15 @@ def require_compatible(capture: Capture, config: Config) -> None:
 
 
 def is_unlit(capture: Capture) -> bool:
-    """Have the photographs neither lights of their own nor room light?"""
+    """Test whether the capture has no light at all: no light of any photograph, and no room light."""
     return capture.photographs.dark and capture.room is None
 
 
 def exposures(capture: Capture) -> np.ndarray:
-    """Strengths (P, 3) of the photographs' own lights relative to their mean: under one light, the exposures."""
+    """Strength (P, 3) of each photograph's own light, divided by the mean over photographs.
+
+    If one light lights all photographs, these are their relative exposures.
+    """
     strengths = capture.photographs.lights.rgb()
     kinds = capture.photographs.lights.is_finite()
     if kinds.any() != kinds.all() or not (strengths > 0).all():
@@ -105,10 +109,10 @@ def exposures(capture: Capture) -> np.ndarray:
 
 
 def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
-    """Replace the lamps of a lighting by those that a fit has found. `capture`: as the fit has calibrated it.
+    """Return `lighting` with the lamps that a fit has estimated. `capture`: calibrated by that fit.
 
-    All lamps are scaled, so that the first brings as much light to the object at `center` (3,) as before: the albedo is
-    an assumption.
+    All lamps are scaled so that the first one lights the object, at `center` (3,), as strongly as before. So the
+    assumed albedo stays valid.
     """
     if not lighting.lamps:
         return lighting
@@ -121,7 +125,10 @@ def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -
 
 
 def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
-    """Put a capture under other lights: an environment starts grey; lamps after the first become lamps of the scene."""
+    """Return the capture under other lights.
+
+    Lamps after the first become lamps of the scene; an environment starts grey.
+    """
     if lighting.kind == "capture":
         return capture
     scene, room, gains = capture.scene, None, exposures(capture)
@@ -141,11 +148,11 @@ def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
 
 
 def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
-    """Move the scene's environment into the harmonics of the room's light, whose reflection has no noise.
+    """Convert the scene's environment map to spherical harmonics of the room, whose reflection has no noise.
 
-    Returns the capture with that room, the scene without the environment, and its harmonics (BASIS, 3) or None. Nothing
-    changes if a photograph has no mask, since the background then shows the environment, and for other reflectances
-    than `cooktorrance`.
+    Returns (capture with that room, scene without the environment, its harmonics (BASIS, 3)). Without an environment
+    map, it returns the capture and its scene as they are, and None. So it does if a photograph has no mask, because its
+    background shows the environment, and for BSDFs other than `cooktorrance`.
     """
     if not all(capture.masks.given) or not hasattr(capture.shape.bsdf(), "lobes"):
         return capture, capture.scene, None
@@ -157,6 +164,6 @@ def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray
 
 
 def room_frames(capture: Capture, lighting: Lighting) -> Collection[str]:
-    """The axes in which unknown room light is fixed: "world", "camera"."""
+    """The coordinate frames in which unknown room light is constant: "world", "camera", both or none."""
     own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

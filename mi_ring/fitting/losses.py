@@ -12,7 +12,7 @@ STEP = 0.02  #: of the Laplacian; small against the period of the encoding's hig
 
 
 def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
-    """Radiance in units of `exposure`, on the scale on which the colour loss `kind` compares it."""
+    """Divide radiance by `exposure` and convert it to the scale of the colour loss `kind`; see `rgb_loss`."""
     linear = photographs / exposure
     if kind in ("l2", "l1"):
         return linear
@@ -23,10 +23,10 @@ def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
 def colour_error(
     predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, counted: Tensor | None = None
 ) -> Tensor:
-    """How much brighter predicted photographs (n, H, W, 3) are than observed ones, after `perceived` of each.
+    """Difference (n, H, W, 3) of predicted and observed photographs (n, H, W, 3), after `perceived` of each.
 
-    `clipped` (n, H, W, 3): the scene is at least as bright as observed, so a brighter prediction is no error. `counted`
-    (n, H, W): pixels where colours count; elsewhere the error is 0. None: all pixels.
+    `clipped` (n, H, W, 3) bool: where the photograph is saturated, a brighter prediction is no error. `counted` (n, H,
+    W) bool: pixels to compare; elsewhere the error is 0. None: all pixels.
     """
     error = perceived(predicted, exposure, kind) - perceived(observed, exposure, kind)
     error = torch.where(clipped, error.clamp(max=0), error)

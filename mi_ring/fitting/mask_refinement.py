@@ -28,9 +28,10 @@ Masks: TypeAlias = dict[int, Tensor]  #: (h, w) uint8, 0 or 1, perhaps of reduce
 
 
 def find_masks(capture: Capture, exposure: float, model: Model, renderer: Renderer, level: int) -> Masks:
-    """Find new masks of the photographs; implausible ones are left out. Photographs from one place share a mask.
+    """Segment the object in the photographs again, near the outline of the current surface: masks by photograph index.
 
-    `exposure`: mean radiance of the object. `level`: of the surface.
+    Implausible masks are left out. Photographs from one viewpoint share a mask. `exposure`: mean radiance of the
+    object. `level`: level of the mesh that is rendered.
     """
     capture = model.calibrated(capture)
     surface = renderer.show(model, level)
@@ -64,7 +65,7 @@ def find_masks(capture: Capture, exposure: float, model: Model, renderer: Render
 
 
 def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
-    """Replace masks of a capture by those that `find_masks` returned."""
+    """Return a capture in which `masks`, from `find_masks`, replace the masks of the photographs with these indices."""
 
     def enlarged(mask: Tensor, size: tuple[int, int]) -> np.ndarray:
         (width, height), (rows, columns) = size, mask.shape

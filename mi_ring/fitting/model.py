@@ -15,7 +15,7 @@ from mi_ring.objects.fitted_object import FittedObject
 
 
 class Model(nn.Module):
-    """A fitted object, `ring`, and the `calibration` of the photographs, None if nothing of it is refined."""
+    """The unknowns of a fit: the object `ring`, and the `calibration` of the photographs (None: not refined)."""
 
     calibration: Calibration | None
 
@@ -36,16 +36,19 @@ class Model(nn.Module):
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 
     def fix_surface(self, fixed: bool) -> None:
-        """Fix the surface, or let it move. Parameters that were frozen at the start stay frozen."""
+        """Freeze Shape-Net if `fixed`, otherwise train it. Parameters that were frozen at the start stay frozen."""
         for parameter in self.to_freeze:
             parameter.requires_grad_(not fixed)
 
     def update_albedo(self) -> None:
-        """Scale the material's brightness by the power of all lights that the fit has found."""
+        """Scale the albedo's initial value inversely to the common factor `scale` of all lights.
+
+        Without this, directly lit surfaces would change their brightness with `scale`.
+        """
         if self.calibration and "scale" in self.calibration.refined:
             net, initial = self.ring.brdf_net, self.albedo / self.calibration.rig.power / math.pi
             net.set_parameters(net.bsdf_parameters, initial * self.calibration.albedo_factor)
 
     def calibrated(self, capture: Capture) -> Capture:
-        """The capture with the current cameras, lights and response."""
+        """Return the capture with the current estimates of cameras, lights and camera response."""
         return self.calibration.applied(capture) if self.calibration else capture

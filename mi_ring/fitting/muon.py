@@ -15,9 +15,9 @@ MOMENTUM = 0.95
 
 
 class Muon(torch.optim.Optimizer):
-    """`torch.optim.Muon` without weight decay, with a choice of the `dtype` in which it orthogonalises.
+    """The optimiser `torch.optim.Muon` without weight decay. It orthogonalises in a `dtype` of your choice.
 
-    PyTorch's own takes bfloat16. Most processors emulate it, 20 times as slow as float32.
+    PyTorch's version always uses bfloat16, which most processors emulate: 20 times slower than float32.
     """
 
     def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype) -> None:
@@ -26,7 +26,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Make one step. That of a tall matrix is longer, by the root of height / width."""
+        """Update all weight matrices once. The step of a tall matrix is √(height / width) times as long."""
         for group in self.param_groups:
             params = [p for p in group["params"] if p.grad is not None]
             updates = []
@@ -46,7 +46,7 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalised(matrix: Tensor, dtype: torch.dtype) -> Tensor:
-    """Make the rows or columns of a matrix about orthonormal: its singular values are then between 0.7 and 1.2."""
+    """Make a matrix approximately orthogonal: its singular values become 0.7 to 1.2."""
     a, b, c = COEFFICIENTS
     x = matrix.to(dtype)
     tall = x.shape[0] > x.shape[1]

@@ -14,7 +14,7 @@ RETREATS = 5  #: number of retreats after which a fit fails
 
 
 class NanGuard:
-    """Watches a model and its optimisers for NaN, and keeps a copy of their numbers."""
+    """Detects NaN in a model and its optimisers, and restores a copy of an earlier, finite state."""
 
     def __init__(
         self, model: nn.Module, optimizers: Sequence[torch.optim.Optimizer], state: dict[str, Any] | None = None
@@ -36,9 +36,10 @@ class NanGuard:
         return all(bool(t.sum().isfinite()) for t in tensors)
 
     def note(self, healthy: bool) -> bool:
-        """Record an iteration, and restore the copy if necessary. Returns False if that has happened too often.
+        """Record an iteration. After repeated failures, or if the model is not finite, restore the last copy.
 
-        `healthy`: loss and gradients were finite, and the optimisers have made their steps.
+        `healthy`: loss and gradients were finite, and the optimisers have made their steps. Returns False after too
+        many restorations; the fit has then diverged.
         """
         self.failures = 0 if healthy else self.failures + 1
         if self.failures < PATIENCE and self.finite():
@@ -57,5 +58,8 @@ class NanGuard:
         self.copy, self.steps = copy.deepcopy([part.state_dict() for part in parts]), 0
 
     def state(self) -> dict[str, Any]:
-        """Numbers for a checkpoint. It needs no copy: its parameters are finite."""
+        """Return the guard's counters for a checkpoint.
+
+        A copy is not saved, because the checkpoint itself is finite.
+        """
         return {"factor": self.factor, "retreats": self.retreats, "failures": self.failures}

@@ -26,9 +26,9 @@ CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one ma
 
 
 def network_steppers(networks: nn.Module, config: Config, device: torch.device) -> list[Stepper]:
-    """Make the optimisers of networks: Muon for hidden weight matrices and Adam for the rest, or Adam for all.
+    """Make the optimisers of both networks: Muon for hidden weight matrices and Adam for the rest, or only Adam.
 
-    Hidden are the layers that a network, or a part of it, holds as `hidden`, an `nn.ModuleList` of linear layers.
+    Hidden layers are the linear layers in an attribute `hidden`, an `nn.ModuleList`, of a network or of its submodules.
     """
     lists = [getattr(part, "hidden", None) for part in networks.modules()]
     layers = [layer for some in lists if isinstance(some, nn.ModuleList) for layer in some]
@@ -44,7 +44,7 @@ def network_steppers(networks: nn.Module, config: Config, device: torch.device) 
 
 
 def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepper]:
-    """Make the optimisers, Adam, for the unknowns of calibration that have no solver."""
+    """Make the optimisers of the calibration: Adam for the unknowns that no solver estimates."""
     groups = calibration.parameters_without_solver()
     if not groups:
         return []
@@ -54,7 +54,10 @@ def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepp
 
 @torch.no_grad()
 def solve_room(calibration: Calibration, it: Iteration) -> None:
-    """Add an iteration's photographs to the normal equations of the room's light and solve them, once it is time."""
+    """Add the photographs of an iteration to the normal equations of the room's light, and solve for its harmonics.
+
+    Does nothing before it is time to refine the room's light.
+    """
     other, seen, batch = it.prediction.other_light, it.observation, it.batch
     if other is None or not calibration.solves_room(it.progress):
         return
@@ -81,10 +84,11 @@ class Optimisation:
         self.guard = NanGuard(model, self.optimizers)
 
     def step(self, evaluate: Callable[[], tuple[Tensor, Iteration]]) -> Iteration:
-        """Evaluate the loss of an iteration, backpropagate it, and step all optimisers. Returns the iteration.
+        """Evaluate the loss of an iteration, backpropagate, and step all optimisers. Returns the iteration.
 
-        No optimiser steps if a number is not finite, or if no term of the loss applies: for instance masks alone, and
-        photographs without masks. Optimisers may `evaluate` again. Raises InputError if the fit diverges.
+        Optimisers may call `evaluate` several times. No optimiser steps if loss or gradients are not finite, or if no
+        term of the loss applies, for instance only `mask` to photographs without masks. Raises InputError if the fit
+        diverges.
         """
         loss, it = evaluate()
         if self.model.calibration:
@@ -115,7 +119,10 @@ class Optimisation:
         return it
 
     def settle(self, schedule: Schedule, iteration: int) -> None:
-        """Fix the surface during the settling stage. At its start, reset the room light's equations."""
+        """Freeze the surface if `iteration` is in the settling stage, otherwise let it move.
+
+        When the settling stage begins, the normal equations of the room's light start anew.
+        """
         fixed = schedule.shaping <= iteration < schedule.iterations
         self.model.fix_surface(fixed)
         if fixed and iteration == schedule.shaping and self.model.calibration:
@@ -123,7 +130,7 @@ class Optimisation:
             self.guard.keep()  # so that a retreat does not restore the old equations
 
     def backward(self, loss: Tensor, it: Iteration) -> float:
-        """Compute the gradients of the loss, summed over all processes. Returns the loss of all processes."""
+        """Backpropagate the loss, and sum the gradients over all processes. Returns the loss of all processes."""
         processes = self.problem.processes
         for optimizer in self.optimizers:
             optimizer.zero_grad()

@@ -30,7 +30,7 @@ NEAR, FAR = 0.2, 0.4  #: progress at which steps begin, for a start near the obj
 
 
 def slopes(picture: Tensor) -> Tensor:
-    """Central differences of a picture (H, W, C) to the right and down: (H, W, C, 2)."""
+    """Image gradient of a picture (H, W, C) by central differences: (H, W, C, 2), to the right and down."""
     padded = F.pad(picture.movedim(-1, 0), (1, 1, 1, 1), mode="replicate")
     right = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
     down = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
@@ -38,12 +38,12 @@ def slopes(picture: Tensor) -> Tensor:
 
 
 def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: float) -> Tensor:
-    """How far the pixels of a sphere move with the camera: (H, W, 2, 6) [px], right and down.
+    """Jacobian (H, W, 2, 6) of pixel positions [px; right, down] on a sphere with respect to the camera's pose.
 
-    The six columns: a turn [rad] about each axis of the camera, and a step [scene units] along each (Mitsuba's axes).
-    `intrinsics` (4,): fx, fy, cx, cy [px]; distortion hardly matters. `size`: (width, height). `center` (3,): of the
-    sphere, in the camera's axes. It is made smaller if the camera is inside. Rays that miss it have the depth of their
-    point nearest to it.
+    The six columns: rotation [rad] about each axis of the camera, then translation [scene units] along each (Mitsuba's
+    axes). `intrinsics` (4,): fx, fy, cx, cy [px], without distortion. `size`: (width, height) of the picture. `center`
+    (3,), `radius`: the sphere, in camera coordinates; smaller if the camera is inside. A ray that misses the sphere
+    gets the depth of its point nearest to the sphere.
     """
     width, height = size
     fx, fy, cx, cy = intrinsics
@@ -66,7 +66,10 @@ def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: fl
 
 
 class PoseSolver(torch.optim.Optimizer):
-    """Finds the poses of cameras, the unknowns `turn` and `move`: `look` at an iteration, then `step`."""
+    """Estimates camera poses, the unknowns `turn` and `move`, by Gauss-Newton.
+
+    Call `look` with an iteration, then `step`.
+    """
 
     def __init__(self, calibration: Calibration, near: bool, terms: Mapping[str, Term]) -> None:
         """Solve for the poses of a calibration. `near`: the fit starts near the object. `terms`: of the loss.
@@ -82,14 +85,14 @@ class PoseSolver(torch.optim.Optimizer):
         self.seen: tuple[Tensor, Tensor] | None = None  #: photographs and their curvature
 
     def look(self, it: Iteration) -> None:
-        """Remember the photographs of an iteration and the curvature of its loss."""
+        """Store the photographs of an iteration and the Gauss-Newton Hessian of its loss."""
         self.seen = None
         if it.progress >= self.rate.start:
             self.seen = torch.from_numpy(it.batch.all_photographs), it.batch.share.gathered(curvature(it))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Make one Gauss-Newton step along the current gradients. Nothing moves before refinement begins."""
+        """Make one Gauss-Newton step with the current gradients. Does nothing before refinement begins."""
         (group,) = self.param_groups
         turn, move = group["params"]
         if self.seen is None or turn.grad is None:
@@ -106,11 +109,10 @@ class PoseSolver(torch.optim.Optimizer):
 
 @torch.no_grad()
 def curvature(it: Iteration) -> Tensor:
-    """Second derivatives (n, 6, 6) of the loss of an iteration by `turn` and `move` of its photographs.
+    """Gauss-Newton Hessian (n, 6, 6) of an iteration's loss by the pose (`turn`, `move`) of each photograph.
 
-    Of colours, silhouettes and prior, by Gauss-Newton, as if the surface were a sphere. An absolute difference counts
-    as a square with the same slope (iteratively reweighted least squares). The slope of the mean difference is used
-    for those below the mean.
+    It contains colours, silhouettes and prior, and takes the surface as a sphere. Absolute differences are treated by
+    iteratively reweighted least squares; those below the mean get the weight of the mean.
     """
     context, seen, prediction = it.context, it.observation, it.prediction
     calibration, (n, height, width) = context.model.calibration, prediction.coverage.shape

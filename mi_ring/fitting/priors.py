@@ -33,9 +33,9 @@ def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
 
 
 def variation_of_values(vertices: Tensor, faces: np.ndarray, values: Tensor) -> Tensor:
-    """Mean length of the gradient of values (V, C) over a mesh, linear on each triangle, summed over channels.
+    """Total variation of values (V, C), linear on each triangle of a mesh, divided by its area; summed over channels.
 
-    Per unit of length of the vertices (V, 3).
+    It is the mean length of the surface gradient, per unit of length of `vertices` (V, 3). `faces`: (F, 3).
     """
     corners = torch.as_tensor(faces, device=vertices.device)
     a, b, c = vertices[corners].unbind(1)
@@ -47,16 +47,20 @@ def variation_of_values(vertices: Tensor, faces: np.ndarray, values: Tensor) -> 
 
 
 def number_of_bases(values: Tensor) -> Tensor:
-    """‖M‖₁ / ‖M‖₂ of the singular values of M (V, C), its nuclear norm over Frobenius' norm.
+    """Smooth measure of the rank of M, `values` (V, C): nuclear norm over Frobenius norm, ‖M‖₁ / ‖M‖₂.
 
-    It is 1 for multiples of one basis material, √k for k orthogonal ones of equal strength, and √C at most. The nuclear
-    norm is the convex relaxation of the rank (Fazel 2002). The division keeps it from darkening the material.
+    It is 1 if all rows are multiples of one basis material, √k for k orthogonal bases of equal strength, and at most
+    √C. The nuclear norm is the convex relaxation of the rank (Fazel 2002). The division keeps it from darkening the
+    material.
     """
     return torch.linalg.matrix_norm(values, "nuc") / values.norm()
 
 
 def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
-    """Arrange the material of V points as numbers near 1, (V, C): in units of `scale`, or as shares of the range."""
+    """Arrange the material parameters of V points as a matrix (V, C) of numbers near 1.
+
+    Parameters without upper bound are divided by their `scale`; others become a share of their range.
+    """
     columns = []
     for p in brdf_net.bsdf_parameters:
         unit = float(brdf_net.scale) if math.isinf(p.high) else p.high - p.low
@@ -71,10 +75,11 @@ def normal_variation(it: Iteration) -> Tensor:
 
 
 def albedo_variation(it: Iteration) -> Tensor:
-    """Mean gradient of the material over the surface, times the object's radius. The shape gets no gradient.
+    """The term `albedo_variation`: mean surface gradient of the material, times the object's radius.
 
-    Reflectances are divided by their mean: half the reflectance in twice the light looks the same. A parameter with an
-    upper bound (a roughness) counts by its logit: as a share it would vary less near its bounds.
+    Reflectances are divided by their mean, because half the reflectance in twice the light looks the same. A parameter
+    with an upper bound (a roughness) counts by its logit: as a share it would vary less near its bounds. The shape gets
+    no gradient.
     """
     ring, prediction = it.context.model.ring, it.prediction
     values = columns_of(prediction.material, ring.brdf_net)

@@ -34,7 +34,10 @@ class Problem:
 
     @classmethod
     def of(cls, capture: Capture, config: Config, lighting: Lighting) -> "Problem":
-        """Prepare a fit. Raises InputError if no photographs are left to fit, or if the object is black in them."""
+        """Prepare a fit of `capture`.
+
+        Raises InputError if no photograph is left to fit, or if the object is black in all.
+        """
         given, capture = capture, reduced(capture, max(WIDTH, *config.widths))
         held_out = held_out_photographs(capture, config.holdout)
         fitted = np.setdiff1d(np.arange(len(capture)), held_out)
@@ -45,9 +48,9 @@ class Problem:
 
 
 def held_out_photographs(capture: Capture, every: int) -> np.ndarray:
-    """Choose one photograph in `every`, starting in the middle of the first `every`: indices; none if that is 0.
+    """Choose the validation photographs: every n-th, n = `every`, from index n // 2 on.
 
-    Raises InputError if no photograph or all photographs would be held out.
+    Returns indices; none if n is 0. Raises InputError if no photograph or all photographs would be held out.
     """
     several = len(capture)
     found = np.arange(several)[every // 2 :: every] if every else np.arange(0)

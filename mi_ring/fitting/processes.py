@@ -41,11 +41,11 @@ class Processes:
         return max(1, cores() // self.on_this_machine)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """The sum of the tensors of all processes, the same in all. All tensors have one shape."""
+        """Sum a tensor over all processes. Each process gets the result. The tensors must have one shape."""
         return tensor
 
     def broadcast(self, value: Value) -> Value:
-        """The value of the first process, sent to all others by pickle."""
+        """Return the `value` of the first process, in all processes. It is sent by pickle."""
         return value
 
     def agreed(self, work: Callable[[], Value]) -> Value:
@@ -57,14 +57,14 @@ class Processes:
         return work()
 
     def maximum(self, number: int) -> int:
-        """The largest number of all processes."""
+        """Return the largest `number` of all processes."""
         return number
 
     def barrier(self) -> None:
-        """Wait until all processes are here."""
+        """Wait until all processes have called this."""
 
     def share(self, total: int) -> "Share":
-        """The share of this process in `total` photographs or points."""
+        """Return the part of `total` photographs or points that this process works on."""
         return Share(self, total)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
@@ -87,7 +87,7 @@ class Team(Processes):
         atexit.register(self.leave)
 
     def leave(self) -> None:
-        """Leave the process group when the process ends. A process cannot join twice."""
+        """Leave the process group, when the process ends. A process cannot join a group twice."""
         with contextlib.suppress(RuntimeError):
             self.distributed.destroy_process_group()
 
@@ -167,7 +167,10 @@ class Team(Processes):
 
 
 class Rows(torch.autograd.Function):
-    """All rows of a tensor (N, C) of which each process has a part. Gradients are summed over all processes."""
+    """Autograd function that joins the rows of all processes to one tensor (N, C).
+
+    Gradients are summed over processes.
+    """
 
     @staticmethod
     def forward(ctx: Any, own: Tensor, share: "Share") -> Tensor:
@@ -177,7 +180,7 @@ class Rows(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        """The gradients of the loss of all processes."""
+        """Return the gradient of the summed loss of all processes with respect to this process's rows."""
         return ctx.share.processes.sum(grad)[ctx.share.part], None
 
 
@@ -195,11 +198,14 @@ class Share:
         self.part = slice(first, last) if last > first else slice(min(first, total - 1), min(first, total - 1) + 1)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """Sum over all photographs, from the sum over those of this process. Without gradients."""
+        """Sum over all processes a `tensor` that this process has summed over its own photographs.
+
+        Without gradients.
+        """
         return self.processes.sum(tensor if self.weight else torch.zeros_like(tensor))
 
     def gathered(self, tensor: Tensor) -> Tensor:
-        """Join the rows (n, …) of all processes in order: (N, …) for all photographs. Without gradients."""
+        """Join the rows (n, …) of all processes to (N, …), in the order of the N photographs. Without gradients."""
         if self.processes.count == 1:
             return tensor
         whole = tensor.new_zeros(self.total_count, *tensor.shape[1:])
@@ -208,7 +214,7 @@ class Share:
         return self.processes.sum(whole)
 
     def concatenated(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Join tensors (n, …) for the points of each process to tensors (N, …) for all points. With gradients."""
+        """Join tensors (n, …) of each process's points to tensors (N, …) of all points. With gradients."""
         if self.processes.count == 1:
             return list(tensors)
         columns = [tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None] for tensor in tensors]
@@ -221,21 +227,22 @@ _current: Processes = ALONE
 
 
 def current() -> Processes:
-    """The processes within `joined`; outside of it a single process."""
+    """Return the processes of the current fit: inside `joined` the whole team, elsewhere a single process."""
     return _current
 
 
 @functools.cache
 def team_of_this_process() -> Team:
-    """The group that this process belongs to, connected once."""
+    """Return the team of processes to which this process belongs. The first call connects them."""
     return Team()
 
 
 @contextlib.contextmanager
 def joined() -> Iterator[Processes]:
-    """Context in which the processes that `torchrun` has started work on one fit. Other processes stay single.
+    """Context manager in which the processes that `torchrun` has started work on one fit.
 
-    Only the first process prints. An InputError, which the first process reports, ends the others silently.
+    A process that torchrun has not started works alone. Only the first process prints. It also reports an InputError;
+    the others then end silently.
     """
     global _current
     if int(os.environ.get("WORLD_SIZE", 1)) == 1 or "TORCHELASTIC_RUN_ID" not in os.environ:
@@ -255,6 +262,6 @@ def joined() -> Iterator[Processes]:
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Context in which printed text is dropped."""
+    """Context manager that discards printed text."""
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
         yield

@@ -30,10 +30,10 @@ class Refinement(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, center: np.ndarray) -> "Refinement":
-        """Decide what to refine, from settings and capture; choose `power` if the albedo is impossible.
+        """Decide what to refine, by the settings and by what the capture says about itself.
 
-        `center` (3,): of the object. Only if `scale` is refined, `power` differs from 1: it makes the albedo a usual
-        one.
+        `center` (3,): of the object. Only if the light scale is refined, `power` differs from 1: it is the factor of
+        all lights that gives the object a usual albedo.
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo = math.pi * reflectance
@@ -42,14 +42,14 @@ class Refinement(NamedTuple):
 
     @property
     def albedo(self) -> float:
-        """Albedo of the object, according to the lights' intensities; above 1 they cannot be true."""
+        """Albedo of the object that follows from the lights' intensities. If it is above 1, these cannot be true."""
         return math.pi * self.reflectance
 
 
 def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
-    """The options of `--refine` that a fit refines; `auto` depends on what the capture says about itself.
+    """List the options of `--refine` that a fit refines. For `auto`, what the capture says about itself decides.
 
-    `light`: kind of the `Lighting`. `albedo`: the object's, according to the lights' intensities.
+    `light`: the `Lighting.kind`. `albedo`: that of the object, as it follows from the lights' intensities.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known

@@ -16,7 +16,7 @@ UNEXPLAINED = 0.2  #: share of unexplained light at which the regulariser has fu
 
 
 class RegulariserStrength:
-    """Decides from the last iterations how far the regulariser may weaken."""
+    """Schedules the regulariser's weight by the unexplained light and the self-intersections of recent iterations."""
 
     def __init__(self) -> None:
         self.crossing: float = 0.0  #: share of self-intersecting triangles at the last count
@@ -25,11 +25,11 @@ class RegulariserStrength:
         self.unexplained: float = 1.0  #: running mean of `Iteration.unexplained`
 
     def note(self, it: Iteration) -> None:
-        """Update the strength after an iteration.
+        """Update the strength after the iteration `it`.
 
-        Where photographs disagree with the model, a weak regulariser lets the surface fold. So it gets stronger while
-        the surface intersects itself. Early intersections of growing limbs are normal, and the regulariser catches up
-        afterwards. After late ones it does not.
+        Where photographs disagree with the model, a weak regulariser lets the surface fold. So the strength grows while
+        the surface intersects itself. After early intersections, which growing limbs cause, it catches up with its
+        schedule. After late ones it does not.
         """
         step = 1 / it.context.schedule.shaping
         if it.number % CROSSING_EVERY == 0:

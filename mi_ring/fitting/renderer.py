@@ -23,7 +23,10 @@ from mi_ring.system.machine import autocast
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model predicts for a batch: V vertices, n photographs of H × W pixels. Attached until `detached`."""
+    """What a model predicts for a batch: V vertices and n photographs of H × W pixels.
+
+    Has gradients until `detached`.
+    """
 
     vertices: Tensor  #: (V, 3) [scene units]
     material: dict[str, Tensor]  #: parameters of the BSDF by name, (V, 3) or (V,)
@@ -35,7 +38,7 @@ class Prediction:
     without_room: Tensor  #: (n, H, W, 3) linear radiance with the room's light as if nothing occluded it; detached
 
     def detached(self) -> "Prediction":
-        """A copy without the graph of gradients, which uses memory."""
+        """Return a copy without the autograd graph, which uses memory."""
         return replace(self, vertices=self.vertices.detach(), rgb=self.rgb.detach(), coverage=self.coverage.detach(),
                        material={name: value.detach() for name, value in self.material.items()})  # fmt: skip
 
@@ -49,14 +52,17 @@ class Renderer:
         self.averages: Averages = {}  #: of interreflection
 
     def show(self, model: Model, level: int) -> Surface:
-        """Write the surface of a model at this level, under its lamps, to be drawn without gradients."""
+        """Evaluate the model at this mesh level. Returns the surface and its lamps for rendering without gradients."""
         self.surface.show(model.ring, *model.ring.domain.sample(level))
         if model.calibration:
             model.calibration.relight(self.surface)
         return self.surface
 
     def picture(self, model: Model, capture: Capture, k: int, width: int, level: int, spp: int) -> np.ndarray:
-        """Predict photograph `k`, at most `width` pixels wide: (H, W, 3) linear. `level`: of the mesh."""
+        """Render photograph `k` of the capture from the model, at most `width` [px] wide: linear radiance (H, W, 3).
+
+        `level`: level of the mesh. `spp`: samples per pixel.
+        """
         photograph, surface = capture.photograph(k, -(-capture.shots[k].size[0] // width)), self.show(model, level)
         rgb, _ = prediction.draw(surface, photograph, spp, shadows=capture.shadows, indirect=model.ring.indirect)
         return rgb[0].numpy()
@@ -91,7 +97,11 @@ class Renderer:
         return Prediction(vertices, material, rgb, coverage, photographs, other, averages, without_room)
 
     def deform(self, problem: Problem, ring: FittedObject, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute vertices (V, 3) and material (V, …) at the batch's points. Several processes share the work."""
+        """Evaluate the networks at the batch's domain points.
+
+        Returns vertices (V, 3) and material parameters (V, …) by name. If there are several processes, each evaluates a
+        part of the points.
+        """
         points = problem.processes.share(len(batch.points))
         with self.autocast():
             vertices, material = ring(batch.points[points.part])
@@ -101,7 +111,11 @@ class Renderer:
     def other_light(
         self, model: Model, batch: Batch, photographs: Photographs, coverage: Tensor
     ) -> tuple[GlobalIllumination | None, Averages]:
-        """Render interreflection and room light of the photographs, and average it; None if there is neither light."""
+        """Render interreflection and room light.
+
+        Returns (this light, updated averages), or (None, {}) if there is neither. With a table, interreflection is
+        averaged over iterations; see `averaged`. Otherwise the averages are empty.
+        """
         calibration, indirect, harmonics = model.calibration, model.ring.indirect, photographs.harmonics
         if calibration and calibration.solves_room(batch.progress):
             harmonics = calibration.room.which
@@ -112,7 +126,7 @@ class Renderer:
         return averaged(self.averages, other, batch) if indirect and self.surface.table is not None else (other, {})
 
     def remember(self, prediction: Prediction) -> None:
-        """Add the interreflection of a prediction to the averages."""
+        """Keep the averages of interreflection that `predict` has computed with this prediction."""
         self.averages |= prediction.averages
 
     def state(self) -> Averages:

@@ -24,7 +24,11 @@ def result_of(
     problem: Problem, model: Model, renderer: Renderer, schedule: Schedule, course: Course, capture: Capture,
     terms: Sequence[str], unexplained: float,
 ) -> FitResult:  # fmt: skip
-    """Collect the result of a fit. `capture`: with the masks that it ends with. `terms`: names of the loss's terms."""
+    """Collect the results of a fit.
+
+    `capture`: with its final masks. `terms`: names of the terms of the loss. `unexplained`: see
+    `Iteration.unexplained`.
+    """
     calibration, ring, refined = model.calibration, model.ring, model.calibrated(capture)
 
     def summarised() -> dict[str, Any]:
@@ -57,7 +61,7 @@ def result_of(
 
 
 def room_of(problem: Problem, refined: Capture) -> np.ndarray | None:
-    """Room light (BASIS, 3) without the environment that the scene file has."""
+    """Return the room light (BASIS, 3) of the `refined` capture, minus the environment that the scene file contains."""
     room = refined.room
     if room is None or problem.environment is None:
         return room

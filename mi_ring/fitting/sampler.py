@@ -19,9 +19,9 @@ PURPOSES = "photographs", "rotations", *SEEDED  #: of random generators
 
 @dataclass(frozen=True)
 class Batch:
-    """What an iteration has drawn: domain points, photographs and random seeds.
+    """What one iteration has drawn: V domain points, photographs and random seeds.
 
-    V points; n photographs of this process, of N that all processes together render.
+    n of its photographs are rendered by this process, N by all processes together.
     """
 
     number: int  #: of the iteration, from 1
@@ -38,9 +38,9 @@ class Batch:
 
 
 class Sampler:
-    """Draws batches. Photographs come in random order; all of one size come before one of them comes again.
+    """Draws batches. Photographs come in random order, without repetition until all of the same size have been drawn.
 
-    Each purpose has its own random generator: to switch one off does not change what others draw.
+    Each purpose has a random generator of its own. So switching one off does not change what the others draw.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -54,7 +54,7 @@ class Sampler:
         self.waiting: dict[tuple[int, int], list[int]] = {}
 
     def draw(self, problem: Problem, schedule: Schedule, domain: Domain, iteration: int) -> Batch:
-        """Draw the batch of an iteration, which is counted from 0."""
+        """Draw the batch for an `iteration`, counted from 0."""
         stage = schedule.stage(iteration)
         points, faces = domain.sample(stage.level, self.random["rotations"] if problem.config.resample else None)
         everyone, size = self.draw_photographs(problem.config.batch)
@@ -64,7 +64,10 @@ class Sampler:
                      everyone[share.part], everyone, size, -(-size[0] // stage.width), seeds, share)  # fmt: skip
 
     def draw_photographs(self, count: int) -> tuple[np.ndarray, tuple[int, int]]:
-        """Draw `count` photographs of one size, or all of it if there are fewer: indices, and the size."""
+        """Draw `count` photographs of one size, or all of that size if there are fewer.
+
+        Returns (their indices, their size (width, height) [px]).
+        """
         random = self.random["photographs"]
         size = self.sizes[int(torch.randint(len(self.sizes), (), generator=random))]
         alike, waiting = self.alike[size], self.waiting.get(size, [])
@@ -85,7 +88,7 @@ class Sampler:
         return {"random": {name: random.get_state() for name, random in self.random.items()}, "waiting": self.waiting}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state()`. Raises ValueError if it has photographs that are not fitted here."""
+        """Continue from `state()`. Raises ValueError if it contains photographs that this fit does not use."""
         if not {k for some in state["waiting"].values() for k in some} <= {k for a in self.alike.values() for k in a}:
             raise ValueError("photographs that are not fitted")
         for name, random in self.random.items():

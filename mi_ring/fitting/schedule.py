@@ -45,15 +45,16 @@ class Stepper(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """The stages of a fit, and all that depends on its progress."""
+    """The stages of a fit, and all quantities that change with its progress."""
 
     stages: tuple[Stage, ...]
 
     @classmethod
     def of(cls, config: Config, near: bool = False, settling: bool = False) -> "Schedule":
-        """Plan a fit with these settings. Stages without iterations are left out.
+        """Plan the stages of a fit with these settings. Stages without iterations are left out.
 
-        `near`: the fit starts near the object. `settling`: a last stage with a fixed surface is added.
+        `near`: does the fit start near the object's surface? `settling`: add a last stage in which the surface is
+        fixed.
         """
         shares = list(config.shares)
         if near and len(shares) > 1:

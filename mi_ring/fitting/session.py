@@ -33,9 +33,10 @@ WORTH_MEASURING = 60  #: iterations: shorter fits do not measure how long an ite
 
 @contextlib.contextmanager
 def ending_signals() -> Iterator[Callable[[], int]]:
-    """Yields a function that returns the first signal that has come, or 0. A second Ctrl-C ends the fit at once.
+    """Context manager that catches the signals which end a fit. A second Ctrl-C ends the program at once.
 
-    Other signals may come repeatedly, from shells, schedulers and the kernel.
+    Yields a function that returns the first signal received, or 0. Other signals may arrive repeatedly, from shells,
+    schedulers and the kernel.
     """
     received: list[int] = []
 
@@ -97,7 +98,10 @@ class Keeper:
             self.failing = False
 
     def finish(self, fitted_scene: bytes) -> None:
-        """Write the results; if that is impossible, write them to a new temporary folder and raise InputError."""
+        """Write the results. If that fails, write them to a new temporary folder and raise InputError.
+
+        `fitted_scene`: content of the scene file with the fitted object.
+        """
         if not self.writes:
             return
         result = self.fit.result()
@@ -108,7 +112,10 @@ class Keeper:
             raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(result, fitted_scene)}") from error
 
     def rescue(self, result: FitResult, fitted_scene: bytes) -> str:
-        """Write checkpoint and results to a temporary folder, as far as possible. Returns where, as a sentence."""
+        """Write as much as possible of checkpoint and results to a temporary folder.
+
+        Returns a sentence that says where.
+        """
         saved = ""
         try:
             elsewhere = Path(tempfile.mkdtemp(prefix=f"mi_ring-{self.folder.name}-")) / self.folder.name
@@ -126,7 +133,10 @@ class Keeper:
 
 
 def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
-    """Iterate to the end or until interrupted, with a progress bar, a log and checkpoints. `costs`: None: measured."""
+    """Run the iterations until the end or an interruption, with progress bar, log and checkpoints.
+
+    `interrupted` returns the signal received, or 0. `costs`: seconds per iteration; None: measure them.
+    """
     if costs is None and fit.iterations - fit.iteration >= WORTH_MEASURING and not interrupted():
         left = [stage for stage in fit.schedule.stages if stage.last > fit.iteration]
         costs = fit.problem.processes.broadcast(measure(fit, left, interrupted))
@@ -160,7 +170,7 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
 
 @contextlib.contextmanager
 def resume_hint(folder: Path) -> Iterator[None]:
-    """Context in which a second Ctrl-C, which drops the results, says how to resume."""
+    """Context manager that prints how to resume if a second Ctrl-C ends the program without results."""
     try:
         yield
     except KeyboardInterrupt:
@@ -170,7 +180,7 @@ def resume_hint(folder: Path) -> Iterator[None]:
 
 
 def start_of(fit: Fit) -> str:
-    """Describe the surface that a fit starts from."""
+    """Describe in words the surface from which a fit starts."""
     domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
     if isinstance(domain, Sphere):
         missing = fit.problem.config.domain == "auto" and fit.capture.whole and not installed("gpytoolbox")
@@ -180,10 +190,10 @@ def start_of(fit: Fit) -> str:
 
 
 def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Costs | None = None) -> int:
-    """Run a fit in a folder and write its results, whatever ends it.
+    """Run a fit and write its results into `folder`, even if it is interrupted or fails.
 
-    Returns the signal that interrupted it, or 0. `prepare` makes the folder again if it is removed. `costs`: seconds of
-    an iteration, if they are known.
+    Returns the signal that interrupted it, or 0. `prepare` makes the folder again if someone removes it. `costs`:
+    seconds per iteration, if known.
     """
     processes, model, config = fit.problem.processes, fit.model, fit.problem.config
     fitted_scene = processes.on_first(lambda: results.fitted_scene(fit.problem.given, fit.ring, folder))

@@ -24,7 +24,7 @@ from mi_ring.system.optional import installed
 
 
 def require_settings(capture: Capture, config: Config) -> None:
-    """Raise InputError for settings that do not go with a capture."""
+    """Raise InputError if a setting contradicts the capture."""
     if not capture.images:
         raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
     if {"curve", "contrast"} & set(config.refine) and any(shot.files.ambient for shot in capture.shots):
@@ -39,7 +39,7 @@ def require_settings(capture: Capture, config: Config) -> None:
 
 
 def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -> FittedObject:
-    """Make the object before the first iteration. `networks`: (Shape-Net, BRDF-Net) in place of the default ones.
+    """Make the object as it is before the first iteration. `networks`: (Shape-Net, BRDF-Net); None: the default ones.
 
     Raises InputError if capture, settings and networks do not go together.
     """
@@ -79,9 +79,9 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
 
 
 def with_fresnel(bsdf: str) -> str:
-    """Add the Fresnel term to a `cooktorrance` given as XML, unless the XML decides about it.
+    """Switch on the Fresnel term in `bsdf`, the XML of a `cooktorrance`, unless the XML sets it to true or false.
 
-    Under a flash at the camera the term does not matter. Under light from the other side it does.
+    The term makes no difference for a flash at the camera, but it does for light from other sides.
     """
     element = ElementTree.fromstring(bsdf)
     if element.find("boolean[@name='fresnel']") is None:
@@ -90,7 +90,10 @@ def with_fresnel(bsdf: str) -> str:
 
 
 def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:
-    """Choose the domain of a fit, and centre and radius of the normalising sphere: by `--domain`, else by the scene."""
+    """Choose the start surface. Returns (domain, centre (3,) and radius of the normalising sphere [scene units]).
+
+    `choice`: the setting `domain`, which may leave the choice to the scene.
+    """
     shape = capture.shape
     if isinstance(choice, tuple):
         return closed_domain(load_closed_mesh(choice[1], "--domain"), shape.center, shape.radius)
@@ -112,7 +115,10 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
 
 
 def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
-    """Raise InputError if a camera or its light is inside the start surface, or if a camera looks away from it."""
+    """Raise InputError if a camera or its light is inside the start surface, or if a camera faces away from it.
+
+    `center` (3,), `radius`: the normalising sphere [scene units].
+    """
     cameras, lights = [shot.camera for shot in capture.shots], capture.photographs.lights
     surface = center + radius * domain.points
     ahead = [((surface - camera.position) @ camera.forward).max() for camera in cameras]
@@ -132,7 +138,7 @@ def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarr
 
 
 def require_networks(ring: FittedObject) -> None:
-    """Raise InputError for networks whose outputs are not of the shapes that a fit needs."""
+    """Raise InputError if the outputs of Shape-Net or BRDF-Net have wrong shapes."""
     s = torch.zeros(2, 3, device=next(ring.parameters()).device)
     with torch.no_grad():
         moved = ring.shape_net(s)

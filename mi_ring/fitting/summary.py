@@ -15,9 +15,9 @@ from mi_ring.fitting.problem import Problem
 def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
     """Collect the content of calibration.json: `refined` (options), `light` (its kind), `unknowns`, `photographs`.
 
-    `unknowns`: of each its meaning (`what`), `before`, `after` and, except for the room's light, the standard deviation
-    `std` with the surface fixed. `photographs`: of each fitted photograph how far its picture of the object has moved
-    [px], and its own unknowns. `refined`: the capture with all values found; `deviations`: from `covariance`.
+    `unknowns`: for each its meaning (`what`), `before`, `after` and, except for the room's light, the standard
+    deviation `std` for a fixed surface. `photographs`: for each fitted one how far the object has moved in it [px], and
+    the unknowns of this photograph. Arguments: `refined`, the calibrated capture; `deviations`, from `covariance`.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None

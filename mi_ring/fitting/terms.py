@@ -19,7 +19,7 @@ REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iter
 
 
 class Term(NamedTuple):
-    """A term of the loss: its function, its weight, and a factor of the weight that may change during the fit."""
+    """A term of the loss: a function, its weight, and a factor of the weight that may change during the fit."""
 
     function: Callable[[Iteration], Tensor | None]  #: its value, a scalar; None: it does not apply this time
     weight: float = 1.0  #: used if `Config.weights` has none of its name; 0 switches the term off
@@ -30,16 +30,16 @@ TermLike: TypeAlias = Term | Callable[[Iteration], Tensor | None]
 
 
 def rgb(it: Iteration) -> Tensor:
-    """The term `rgb`: colours of predicted photographs against observed ones."""
+    """The term `rgb`: difference between predicted and observed colours."""
     seen, context = it.observation, it.context
     return rgb_loss(it.prediction.rgb, seen.rgb, seen.clipped, context.exposure, context.config.loss, it.counted())
 
 
 def mask(it: Iteration) -> Tensor | None:
-    """The term `mask`: predicted silhouettes against the masks of photographs that have one.
+    """The term `mask`: difference between predicted silhouettes and masks. None if no photograph has a mask.
 
-    Masks of a lit room are guesses. Once the shape has settled, the majority outweighs single wrong masks: for instance
-    one that takes a shadow for a part of the object.
+    In a lit room, masks are estimates. Once the shape has settled, the majority of masks outweighs single wrong ones,
+    for instance one that contains a shadow.
     """
     seen, context = it.observation, it.context
     masked = float(it.batch.share.sum(seen.masked.sum()))
@@ -58,7 +58,7 @@ def mask(it: Iteration) -> Tensor | None:
 
 
 def velocity(it: Iteration) -> Tensor | None:
-    """The term `velocity`, L_reg: at random points on the paths of domain points, while the surface moves."""
+    """The term `velocity`, L_reg, at random points on the paths of domain points. None while the surface is fixed."""
     if it.stage.settles:
         return None
     net = it.context.model.ring.shape_net
@@ -79,7 +79,10 @@ def calibration(it: Iteration) -> Tensor | None:
 
 
 def settling(it: Iteration) -> Tensor | None:
-    """The term `settling`: variation of the material once the surface is fixed; slow variation is rather light."""
+    """The term `settling`: variation of the material while the surface is fixed.
+
+    Slow variation is probably due to light.
+    """
     return priors.albedo_variation(it) if it.stage.settles else None
 
 
@@ -117,11 +120,11 @@ class Loss:
             raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
 
     def weight(self, name: str) -> float:
-        """Weight of a term before its schedule; 0 if there is no such term."""
+        """Return the weight of the term `name` before scheduling; 0 if there is no such term."""
         return self.weights.get(name, self.terms[name].weight) if name in self.terms else 0.0
 
     def require_velocity(self, shape_net: Flow) -> None:
-        """Raise InputError if the paper's regulariser is among the terms and Shape-Net has no velocity."""
+        """Raise InputError if the term `velocity` is used but `shape_net` has no velocity field."""
         needed = self.terms.get("velocity") is default_terms["velocity"] and self.weight("velocity") > 0
         if needed and not hasattr(shape_net, "velocity"):
             raise InputError(f"networks: {type(shape_net).__name__}: has no velocity, which the term of that name "

@@ -23,9 +23,10 @@ PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per
 
 
 def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) -> float:
-    """Compute the mean absolute error on the object in held-out photographs, as a share of its light; may be NaN.
+    """Mean absolute error on the object in held-out photographs, divided by the observed radiance.
 
-    Each photograph is compared at its best exposure. `level`: of the surface.
+    Each prediction is first scaled to fit its photograph best. `level`: level of the mesh. NaN if no held-out
+    photograph shows the object.
     """
     capture, shares = model.calibrated(problem.capture), []
     surface = renderer.show(model, level)
@@ -45,10 +46,10 @@ def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) 
 
 @torch.no_grad()
 def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Any]:
-    """Reset each option of `--refine` whose values do not explain held-out photographs better than the capture's.
+    """Reset each option of `--refine` that does not improve the prediction of held-out photographs.
 
-    Returns `unexplained` of the result; `before`: the same with all unknowns as the capture says; `put_back`: the
-    options that were reset. The numbers are missing if held-out photographs do not show the object.
+    Returns `unexplained` of the final model; `before`: the same with the capture's values for all unknowns; `put_back`:
+    the options that were reset. If held-out photographs do not show the object, only `put_back` is returned.
     """
     calibration = model.calibration
 

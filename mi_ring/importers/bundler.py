@@ -38,7 +38,7 @@ class Bundler(Photogrammetry):
 
     @property
     def listed(self) -> Path:
-        """The file of the names of the photographs."""
+        """Path of the file that lists the photographs. Raises InputError if there is none."""
         path = self.cameras
         names = [path.with_name(path.name.replace("bundle", "list")).with_suffix(".txt"), path.with_name("list.txt")]
         return first_file([*dict.fromkeys([*names, path.parent.parent / "list.txt"])], f"{path}: list.txt")
@@ -64,7 +64,7 @@ class Bundler(Photogrammetry):
 
 
 def read_cameras(path: Path) -> np.ndarray:
-    """The cameras (N, 5, 3) of a bundle file: f, k1, k2; three rows of R; t."""
+    """Read the cameras (N, 5, 3) of a bundle file. The five rows: (f, k1, k2), three rows of R, t."""
 
     def read(file: Path) -> tuple[list[str], list[str]]:
         with file.open(encoding="utf-8") as text:
@@ -77,7 +77,10 @@ def read_cameras(path: Path) -> np.ndarray:
 
 
 def count_in(head: list[str], path: Path) -> int:
-    """The number of cameras by the first two lines of a bundle file."""
+    """Read the number of cameras from the first two lines (`head`) of a bundle file.
+
+    Raises InputError if it is invalid.
+    """
     if not head or not head[0].startswith(FIRST_LINE):
         raise InputError(f"{path}: SRC: does not begin with {FIRST_LINE!r}; must be a file of Bundler's, bundle.out")
     word = (head[1].split() or [""])[0] if len(head) > 1 else ""

@@ -20,7 +20,7 @@ MAX_SIDE = 10**6  #: of a photograph [px]
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera without its pose, as one of COLMAP's models: https://colmap.github.io/cameras.html"""
+    """The intrinsics of a camera, in one of COLMAP's camera models: https://colmap.github.io/cameras.html"""
 
     model: str  #: COLMAP's name
     size: tuple[int, int]  #: (width, height) [px]
@@ -37,7 +37,7 @@ class Lens:
 
     @cached_property
     def colmap(self) -> Any:
-        """The lens as a `pycolmap.Camera`. Raises InputError if pycolmap is not installed."""
+        """Convert the lens to a `pycolmap.Camera`. Raises InputError if pycolmap is not installed."""
         pycolmap = need("pycolmap", f"camera model {self.model}")
         return pycolmap.Camera(model=self.model, width=self.size[0], height=self.size[1], params=list(self.params))
 
@@ -57,14 +57,17 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Has the lens no distortion? Tested with rays, because a fisheye without coefficients is no pinhole."""
+        """Test whether the lens has no distortion.
+
+        It compares rays, because a fisheye without coefficients is no pinhole.
+        """
         if self.model == "PINHOLE":
             return True
         rays = np.array([[x, y, 1.0] for x in (-0.3, 0.2) for y in (-0.1, 0.4)])
         return np.allclose(self.colmap.img_from_cam(rays), rays[:, :2] * self.focal + self.centre, atol=1e-6)
 
     def scaled(self, size: tuple[int, int]) -> "Lens":
-        """The lens for photographs that were reduced or enlarged to `size` (width, height) [px]."""
+        """Return the lens of the same photographs resized to `size` (width, height) [px]."""
         if self.model == "PINHOLE":
             return Lens("PINHOLE", size, tuple(np.tile(np.divide(size, self.size), 2) * self.params))
         camera = self.colmap  # cached: a copy is changed
@@ -73,15 +76,15 @@ class Lens:
         return Lens(self.model, size, tuple(camera.params))
 
     def camera(self, pose: np.ndarray) -> Camera:
-        """The camera of the undistorted photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
+        """Return the pinhole camera of the undistorted photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
         return Camera(pose @ MITSUBA, np.array(self.focal), np.array(self.centre), self.size)
 
 
 def pinhole_lens(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
-    """Make the lens of a calibration matrix `K` (3, 3) without distortion.
+    """Make a lens without distortion from the calibration matrix `K` (3, 3). `size`: (width, height) [px].
 
-    `shift` [px] is added to the principal point: 0.5 if the tool puts the first pixel's centre at 0. Raises InputError,
-    which begins with `what`, for a matrix with skew.
+    `shift` [px] is added to the principal point: 0.5 if the other tool puts the first pixel's centre at 0. Raises
+    InputError for a matrix with skew; `what` begins the message.
     """
     if not K[2, 2]:
         raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
@@ -93,19 +96,25 @@ def pinhole_lens(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, 
 
 
 def opencv_lens(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: Sequence[float]) -> Lens:
-    """A lens with OpenCV's distortion: radial k1, k2, k3 and tangential p1, p2; `intrinsics`: fx, fy, cx, cy [px]."""
+    """Make a lens with OpenCV's distortion model: radial `k` = (k1, k2, k3), tangential `p` = (p1, p2).
+
+    `size`: (width, height) [px]. `intrinsics`: fx, fy, cx, cy [px].
+    """
     if not any((*k, *p)):
         return Lens("PINHOLE", (size[0], size[1]), tuple(intrinsics))
     return Lens("FULL_OPENCV", (size[0], size[1]), (*intrinsics, *k[:2], *p, k[2], 0, 0, 0))
 
 
 def pose_of(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """The pose (4, 4) whose rotation is R (3, 3) and whose place is t (3,)."""
+    """Join a rotation R (3, 3) and a translation t (3,) to a pose (4, 4)."""
     return np.block([[R, np.reshape(t, (3, 1))], [np.eye(4)[3:]]])
 
 
 def rotation_of(quaternion: object, what: str) -> np.ndarray:
-    """The rotation (3, 3) of a quaternion x y z w. Raises InputError, which begins with `what`, if it is no unit."""
+    """Convert a unit quaternion (x, y, z, w) to a rotation matrix (3, 3).
+
+    Raises InputError if its length is not 1; `what` begins the message.
+    """
     numbers = matrix(quaternion, (4,), what)
     if abs(length := np.linalg.norm(numbers) - 1) > 1e-2:
         raise InputError(f"{what}: is of length {length + 1:.3g}; must be 1")
@@ -113,12 +122,15 @@ def rotation_of(quaternion: object, what: str) -> np.ndarray:
 
 
 def camera_to_world(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """The pose (4, 4) of a camera whose world-to-camera map is x ↦ R x + t."""
+    """Camera-to-world pose (4, 4) of a camera with the extrinsics x_camera = R x_world + t."""
     return pose_of(R.T, -R.T @ t)
 
 
 def decompose_projection(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Split a projection matrix (3, 4) into calibration (3, 3) and pose (4, 4). Raises InputError if it is singular."""
+    """Decompose a projection matrix (3, 4). Returns (calibration matrix (3, 3), camera-to-world pose (4, 4)).
+
+    Raises InputError if the matrix is singular; `what` begins the message.
+    """
     if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
         raise InputError(f"{what}: is no projection matrix of a camera (singular)")
     K, R = scipy.linalg.rq(P[:, :3])

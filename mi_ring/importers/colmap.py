@@ -46,7 +46,10 @@ class Colmap(Photogrammetry):
 
     @staticmethod
     def model(src: Path) -> Path | None:
-        """The folder of the model with the most photographs; None if there is no model."""
+        """Find the model with the most photographs in or below the folder `src`.
+
+        Returns its folder, or None without a model.
+        """
         inside = ((src / inner).glob("*") for inner in ("sparse", "colmap/sparse", "."))
         for places in ([src], [src / "sparse"], *inside):
             if models := sorted(filter(is_model, places)):
@@ -99,12 +102,12 @@ class Colmap(Photogrammetry):
 
 
 def is_model(folder: Path) -> bool:
-    """Does a folder have the images of a model?"""
+    """Test whether a folder contains the images file of a COLMAP model."""
     return any((folder / name).is_file() for name in ("images.bin", "images.txt"))
 
 
 def camera_lines(path: Path) -> Iterator[tuple[int, list[bytes]]]:
-    """Number and words of the line after each camera's line in images.txt: the one of its points."""
+    """Yield (line number, words) of each line of 2-D points in images.txt. It follows the line of its camera."""
     lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
     for number, line in lines:
         if line.strip() and not line.lstrip().startswith(b"#"):
@@ -112,7 +115,7 @@ def camera_lines(path: Path) -> Iterator[tuple[int, list[bytes]]]:
 
 
 def count_images(folder: Path) -> int:
-    """The number of photographs that a model declares."""
+    """Read how many photographs the model in `folder` has."""
     binary = folder / "images.bin"
     if binary.is_file():
         with binary.open("rb") as file:
@@ -121,7 +124,10 @@ def count_images(folder: Path) -> int:
 
 
 def require_points(folder: Path) -> None:
-    """Raise InputError if a camera in images.txt has no line of points, where COLMAP would lose the next camera."""
+    """Raise InputError if a camera in images.txt is not followed by its line of 2-D points, which may be empty.
+
+    COLMAP would take the next camera for this line, and lose it.
+    """
     if (folder / "images.bin").is_file():
         return
     for number, words in camera_lines(path := folder / "images.txt"):

@@ -26,7 +26,10 @@ UNREAD = {
 
 
 def write_scene(source: Source) -> list[Frame]:
-    """Write a source's scene file and changed images, and return the frames. After an InputError nothing is written."""
+    """Write the scene file and all images that must change. Returns the frames.
+
+    Raises InputError before it writes anything.
+    """
     frames = frames_of(source)
     require_most(source, frames)
     adapt_all(source, frames)
@@ -68,7 +71,7 @@ def require_most(source: Source, frames: Sequence[Frame]) -> None:
 
 
 def unread(source: Source) -> str:
-    """A clause for the user if cameras without a photograph have a file of another kind; empty if they have none."""
+    """Name, in a clause for the user, unsupported file formats of the missing photographs; empty if there are none."""
     stems = {stem_of(parts_of(name)[-1]) for name in source.without_photograph if parts_of(name)}
     found = (file for file in source.folder.rglob("[!.]*") if stem_of(file.name.lower()) in stems)
     kinds = {file.suffix.lower() for file in found if file.is_file()} & UNREAD
@@ -76,7 +79,7 @@ def unread(source: Source) -> str:
 
 
 def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
-    """What the scene file takes for granted: encoding, lens, light and exposure."""
+    """List, for the user, the encoding, lens distortion, lights and exposures with which the scene file was written."""
     given = [source.encoding if source.encoding != "auto" else frame.encoding for frame in frames]
     files = [frame.image for frame, encoding in zip(frames, given) if encoding == "auto" and frame.pixels is None]
     found = encodings(files)
@@ -93,13 +96,13 @@ def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
 
 
 def unused_in(files: Iterable[Path]) -> list[str]:
-    """What image files say that is not used, a sentence for each field."""
+    """List the metadata fields of image files that mi_ring does not use, a sentence for each field."""
     found = Counter(f"{name} ({why})" for file in files for name, why in read_as(file, "image", unused_fields).items())
     return [f"Not used in {count} photographs: {' '.join(what.split())[:99]}" for what, count in found.most_common(5)]
 
 
 def report(source: Source, frames: Sequence[Frame]) -> str:
-    """What was left out and why, what was used, and what was assumed: one line each."""
+    """Write the report for the user: what was left out and why, what was used, what was assumed; one line each."""
     lines = list(source.notes)
     total = len(frames) + len(source.without_pose)
     if source.without_pose:

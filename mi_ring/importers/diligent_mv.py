@@ -73,6 +73,6 @@ class DiligentMV(Source):
 
     @property
     def truth(self) -> Path | None:
-        """File of the true mesh; None if there is none."""
+        """Path of the ground-truth mesh; None if there is none."""
         mesh = self.src / "mesh_Gt.ply"
         return mesh if mesh.is_file() else None

@@ -34,7 +34,7 @@ FORMATS: dict[str, type[Source]] = {
 
 
 class Sign(NamedTuple):
-    """How cameras of a format are recognised."""
+    """How to recognise the camera files of a format."""
 
     format: str  #: its name
     what: str  #: for the user
@@ -43,28 +43,28 @@ class Sign(NamedTuple):
 
 
 def has(*fields: str) -> Callable[[Path], bool]:
-    """Is a file JSON whose object has something in one of these fields?"""
+    """Return a test whether a file is a JSON object in which at least one of these fields is not empty."""
     return lambda path: isinstance(top := load_json(path), dict) and any(top.get(field) for field in fields)
 
 
 def has_files(*names: str) -> Callable[[Path], bool]:
-    """Has a folder one of these files?"""
+    """Return a test whether a folder contains at least one of these files."""
     return lambda path: any((path / name).is_file() for name in names)
 
 
 def has_sidecars(folder: Path) -> bool:
-    """Has a folder an XMP sidecar with a pose?"""
+    """Test whether a folder contains an XMP sidecar with a camera pose."""
     return any(accepts(lambda path: "Rotation" in xmp_fields(load_xml(path)), file) for file in folder.glob("*.xmp"))
 
 
 def has_keyframes(folder: Path) -> bool:
-    """Has a folder, or its folder keyframes, a camera of Polycam?"""
+    """Test whether a folder, or its subfolder `keyframes`, contains Polycam cameras."""
     cameras = (next(place.glob("*cameras/[!.]*.json"), None) for place in (folder, folder / "keyframes"))
     return any(isinstance(own := load_json(path), dict) and "t_00" in own for path in cameras if path)
 
 
 def begins(path: Path, word: bytes) -> bool:
-    """Does a file begin with a word?"""
+    """Test whether the first bytes of a file are `word`."""
     with path.open("rb") as file:
         return file.read(len(word)) == word
 
@@ -96,7 +96,7 @@ SIGNS = (
 
 
 def signs_in(place: Path) -> Iterator[tuple[str, Path]]:
-    """The formats of the cameras in a folder, or of a file, with what is SRC of each."""
+    """Yield (format name, SRC path) of all camera files found in `place`, which is a folder or one file."""
     for sign in SIGNS:
         if not place.is_dir():
             paths = [place] if place.suffix.lower() in {Path(name).suffix for name in sign.files} else []
@@ -108,10 +108,11 @@ def signs_in(place: Path) -> Iterator[tuple[str, Path]]:
 
 
 def detect(folder: Path) -> Source | None:
-    """The importer of the cameras in a folder of photographs, otherwise in its parent folder; None without cameras.
+    """Find camera files in a folder of photographs, otherwise in its parent.
 
-    The first of `SIGNS` is taken; of several files, the first by name. Formats whose photographs are not ordinary ones
-    are left out. The photographs are those in `folder` if there are any, except that transforms.json names its own.
+    Returns their importer; None without cameras. The first match in the order of `SIGNS` is taken; of several files,
+    the first by name. Formats whose photographs are not ordinary ones are left out. The importer looks for photographs
+    in `folder`, if there are any; transforms.json names its own.
     """
     images = folder if list_images(folder) else None
     for place in (folder, folder.absolute().parent):
@@ -125,7 +126,10 @@ def detect(folder: Path) -> Source | None:
 
 
 def guess(src: Path) -> tuple[str, Path]:
-    """The format of a file or folder, and what is SRC of it. Raises InputError if there is none, or several."""
+    """Recognise the format of a file or folder. Returns (format name, path to give as SRC).
+
+    Raises InputError if no format or several formats match.
+    """
     found = [*dict.fromkeys(signs_in(src))]
     if len(found) == 1:
         return found[0]
@@ -137,7 +141,7 @@ def guess(src: Path) -> tuple[str, Path]:
 
 
 def accepts(check: Callable[[Path], Any], path: Path) -> bool:
-    """Does a file pass a check? It does not if it cannot be read."""
+    """Return whether `check(path)` is true. A file that cannot be read does not pass."""
     try:
         return bool(check(path))
     except (InputError, OSError, LookupError):

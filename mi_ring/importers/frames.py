@@ -42,11 +42,14 @@ class Frame:
 
     @property
     def camera(self) -> Camera:
-        """The camera of the undistorted photograph."""
+        """The pinhole camera of the undistorted photograph."""
         return self.lens.camera(self.pose)
 
     def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
-        """Make a point light of intensity `rgb`. `offset`: from the camera, in the camera's axes [scene units]."""
+        """Make a point light of intensity `rgb` (3,) that is fixed to the camera.
+
+        `offset` (3,): its position relative to the camera, in the camera's axes [scene units].
+        """
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
 
 
@@ -76,21 +79,21 @@ class Source:
 
     @cached_property
     def without_pose(self) -> set[str]:
-        """The names of photographs without a pose. It is complete when all `frames` have been read."""
+        """Names of photographs without a pose. Complete only after all `frames` have been read."""
         return set()
 
     @cached_property
     def without_photograph(self) -> list[str]:
-        """Names of the cameras without a photograph. It is complete when all `frames` have been read."""
+        """Names of cameras without a photograph. Complete only after all `frames` have been read."""
         return []
 
     @cached_property
     def notes(self) -> list[str]:
-        """Sentences for the user about what was chosen or not used. Complete when all `frames` have been read."""
+        """Sentences for the user about choices and unused data. Complete only after all `frames` have been read."""
         return []
 
     def tell_unused(self, file: Path, names: Iterable[str]) -> None:
-        """Add a note about the fields in a file, by their `names`, that are neither used nor harmless."""
+        """Add a note about those of the fields `names` in `file` that mi_ring does not use although they may matter."""
         if unused := self.fields.unused(names):
             words = [f"{' '.join(name.split())[:60]} ({why})" for name, why in unused.items()]
             self.notes.append(f"{file}: not used: {', '.join(words[:9])}{', …' * (len(words) > 9)}")
@@ -102,12 +105,12 @@ class Source:
 
     @property
     def available(self) -> Sequence[Path]:
-        """The files that may be photographs; empty if the format takes all that it finds."""
+        """Image files that may be photographs; empty if the format uses every image that it finds."""
         return []
 
 
 def frames_of(source: Source) -> list[Frame]:
-    """Read all frames of a source. Any error of its reader becomes an InputError."""
+    """Read all frames of an importer. Any error of the importer becomes an InputError."""
     try:
         return list(source.frames())
     except InputError:
@@ -118,15 +121,15 @@ def frames_of(source: Source) -> list[Frame]:
 
 
 def is_scaled(size: Sequence[int], original: Sequence[int]) -> bool:
-    """May `size` (width, height) [px] be that of the original photograph, reduced or enlarged by at least 5 %?"""
+    """Test whether `size` is `original` resized by at least 5 %, with equal proportions; both (width, height) [px]."""
     factor = max(size) / max(original)
     return abs(factor - 1) > 0.05 and all(abs(a - factor * b) <= 1 for a, b in zip(size, original))
 
 
 def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
-    """Fit a frame's lens to its file: `size` (width, height) [px] as stored, and EXIF `orientation`.
+    """Adapt a frame's lens to its image file: `size` (width, height) [px] as stored, and EXIF `orientation`.
 
-    Returns what was done, for the user; empty if nothing was. A camera of another size is left as it is.
+    Returns for the user what was changed; empty if nothing was. A lens whose size has other proportions is not changed.
     """
     done = ""
     if size != frame.lens.size and orientation > 4 and (
@@ -142,13 +145,13 @@ def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
 
 
 def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
-    """`adapt` the frames to their files. Notes of the source say what was done."""
+    """Call `adapt` for all frames. Its messages are added to the notes of `source`."""
     done = [adapt(f, image_size(f.image), orientation_of(f.image)) for f in frames if f.pixels is None]
     source.notes.extend(f"{count} {what}" for what, count in Counter(filter(None, done)).items())
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
-    """Raise InputError like `require_cameras`, if there are no frames, or if sizes of file and camera differ."""
+    """Raise InputError if there are no frames, if an image and its camera differ in size, or like `require_cameras`."""
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")
     require_cameras(frames)
@@ -166,7 +169,7 @@ def require_frames(frames: Sequence[Frame], source: Path) -> None:
 
 
 def require_cameras(frames: Sequence[Frame]) -> None:
-    """Raise InputError for invalid poses, lenses, lights and file names."""
+    """Raise InputError if a frame has an invalid pose, lens, light or file name."""
     for frame in frames:
         what = f"{frame.image}: camera"
         command.require_utf8(str(frame.image))

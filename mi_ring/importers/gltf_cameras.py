@@ -65,26 +65,29 @@ class GltfCameras(Photogrammetry):
 
 
 def read_gltf(path: Path) -> pygltflib.GLTF2:
-    """A glTF file without its buffers."""
+    """Read a glTF file without its buffers."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: SRC: must end in {' or '.join(SUFFIXES)}")
     return read_as(path, "glTF", lambda file: pygltflib.GLTF2().load(str(file)))
 
 
 def has_cameras(path: Path) -> bool:
-    """Are there several cameras in a glTF file? One may be that of a viewer."""
+    """Test whether a glTF file has at least two cameras. A single one may be that of a viewer."""
     return sum(node.camera is not None for node in read_gltf(path).nodes) > 1
 
 
 def entry(things: list, index: object, what: str) -> pygltflib.Property:
-    """The entry of a list by its index in the file. Raises InputError, which begins with `what`, if there is none."""
+    """Return `things[index]`. Raises InputError if the index from the file is invalid; `what` begins the message."""
     if not isinstance(index, int) or not 0 <= index < len(things):
         raise InputError(f"{what}: is {str(index)[:40]}; there is none of this number")
     return things[index]
 
 
 def placed_nodes(gltf: pygltflib.GLTF2, path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """All nodes, by number, with their transforms to the world (4, 4). Raises InputError if the tree has a loop."""
+    """Yield (node number, node-to-world transform (4, 4)) for all nodes.
+
+    Raises InputError if the node tree has a loop.
+    """
     inner = {child for node in gltf.nodes for child in node.children or ()}
     waiting = [(k, np.eye(4)) for k in range(len(gltf.nodes)) if k not in inner]
     for _ in gltf.nodes:
@@ -100,7 +103,7 @@ def placed_nodes(gltf: pygltflib.GLTF2, path: Path) -> Iterator[tuple[int, np.nd
 
 
 def transform_of(node: pygltflib.Node, what: str) -> np.ndarray:
-    """The transform (4, 4) of a node to its parent: its matrix, which is by columns, or its three parts."""
+    """Node-to-parent transform (4, 4): from the node's column-major matrix, or from translation, rotation and scale."""
     if node.matrix is not None:
         return matrix(node.matrix, (16,), f"{what}.matrix").reshape(4, 4).T
     R = rotation_of(node.rotation or [0, 0, 0, 1], f"{what}.rotation")
@@ -109,7 +112,10 @@ def transform_of(node: pygltflib.Node, what: str) -> np.ndarray:
 
 
 def rigid(place: np.ndarray, what: str) -> np.ndarray:
-    """A transform without its scale, which changes no picture. Raises InputError if it shears or is a mirror."""
+    """Remove the scale from a transform (4, 4); a camera's picture does not depend on it.
+
+    Raises InputError if the transform shears or mirrors; `what` begins the message.
+    """
     scale = np.cbrt(np.linalg.det(place[:3, :3]))
     if not scale > 0 or not np.allclose(place[:3, :3].T @ place[:3, :3], scale**2 * np.eye(3), atol=1e-4 * scale**2):
         raise InputError(f"{what}: scale: it and its parents scale axes differently, or mirror; apply the scales in "
@@ -118,7 +124,7 @@ def rigid(place: np.ndarray, what: str) -> np.ndarray:
 
 
 def lens_of(perspective: pygltflib.Perspective, image: Path, what: str) -> Lens:
-    """The lens of a photograph by the vertical field of view [rad] and the aspect ratio of its camera."""
+    """Make the lens of the photograph `image` from a glTF camera: vertical field of view [rad] and aspect ratio."""
     yfov = float(matrix(perspective.yfov, (), f"{what}: yfov"))
     if not 0 < yfov < math.pi:
         raise InputError(f"{what}: yfov: is {yfov:g}; must be between 0 and pi")

@@ -117,7 +117,10 @@ def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.
 def numbers(
     parent: ElementTree.Element, name: str, shape: tuple[int, ...], what: str, default: np.ndarray | None = None
 ) -> np.ndarray:
-    """Read the numbers in the text of a child. Raises InputError if invalid, or missing without `default`."""
+    """Read numbers of this `shape` from the text of the child element `name`.
+
+    Raises InputError if they are invalid, or missing without a `default`; `what` begins the message.
+    """
     text = parent.findtext(name)
     if text is None and default is not None:
         return default
@@ -126,7 +129,10 @@ def numbers(
 
 
 def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.ndarray:
-    """Move a pose (4, 4) from the chunk's frame to the world by `transform`, whose parts may be missing."""
+    """Convert a pose (4, 4) from the chunk's frame to the world frame.
+
+    `transform`: the XML element with rotation, translation and scale, each of which may be missing.
+    """
     rotation = numbers(transform, "rotation", (3, 3), what, np.eye(3))
     shift = numbers(transform, "translation", (3,), what, np.zeros(3))
     scale = numbers(transform, "scale", (1,), what, np.ones(1))[0]
@@ -136,10 +142,9 @@ def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.
 
 
 def in_rig(sensor: ElementTree.Element, master: ElementTree.Element, what: str) -> np.ndarray:
-    """The pose (4, 4) of a sensor of a rig in the axes of its master sensor.
+    """Pose (4, 4) of a rig's `sensor` relative to the master sensor.
 
-    Raises InputError, which begins with `what`, if it is missing, or relative to the sensor of another camera than
-    `master`.
+    Raises InputError if the pose is missing, or relative to a sensor other than `master`; `what` begins the message.
     """
     if sensor.get("master_id") != master.get("sensor_id"):
         raise InputError(f"{what}: master_id: is {sensor.get('master_id')!r}, but the master of its camera has sensor "
@@ -148,7 +153,7 @@ def in_rig(sensor: ElementTree.Element, master: ElementTree.Element, what: str) 
 
 
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
-    """The lens of a sensor. The formulas are in appendix D of Metashape's manual."""
+    """Make the lens of a sensor. The formulas are in appendix D of Metashape's manual."""
     if sensor.get("type", "frame") not in KINDS:  # a panorama has no calibration
         raise InputError(f"{what}: type: is {sensor.get('type')!r}; must be frame or fisheye; leave such "
                          "photographs out")  # fmt: skip

@@ -15,7 +15,7 @@ from mi_ring.importers.reading import first_file, has_alpha, images_below
 
 @dataclass(frozen=True)
 class NamedPhotographs(Source):
-    """Base of the formats that name the file of each photograph. Each format implements `posed`."""
+    """Base class of formats that name the file of each photograph. Subclasses implement `posed`."""
 
     names: ClassVar[tuple[str, ...]] = ()  #: of the file of cameras, where SRC is a folder
 
@@ -27,28 +27,31 @@ class NamedPhotographs(Source):
     Without it: the masks that the file names, alpha channels, or a folder `masks` beside the photographs."""
 
     def posed(self) -> Iterator[Frame]:
-        """The photographs with a pose. Their field `said` is the path that was given to `photograph`."""
+        """Yield the photographs that have a pose. Each sets `Frame.said` to the path that it passed to `photograph`."""
         raise NotImplementedError
 
     @property
     def cameras(self) -> Path:
-        """The file of the cameras: SRC, or one of `names` in it. Raises InputError if there is none."""
+        """Path of the camera file: SRC itself or, in a folder SRC, one of `names`.
+
+        Raises InputError if there is none.
+        """
         return first_file([self.src / name for name in self.names], "SRC") if self.src.is_dir() else self.src
 
     @property
     def beside(self) -> Path:
-        """The folder of `cameras`; SRC if that is a folder, and the format does not have one file of cameras."""
+        """Folder of the camera file. It is SRC itself for a format without a single camera file."""
         return self.src if self.src.is_dir() and not self.names else self.cameras.parent
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs, unless the format has a rule of its own."""
+        """Folder of the photographs. Formats with another rule override it."""
         candidates = (self.beside / "images", self.beside.parent / "images")
         return self.images or next((folder for folder in candidates if folder.is_dir()), self.beside)
 
     @cached_property
     def photograph_files(self) -> PhotographFiles:
-        """The files that may be photographs: `photographs`, or those in `folder`."""
+        """Index of the files that may be photographs: those in `photographs` if given, otherwise all in `folder`."""
         if self.photographs is not None:
             return PhotographFiles(self.photographs, self.photographs[0].parent if self.photographs else Path())
         return PhotographFiles(images_below(self.folder), self.folder)
@@ -58,10 +61,10 @@ class NamedPhotographs(Source):
         return self.photograph_files.ordinary
 
     def photograph(self, path: str, what: str, relative: bool = False) -> Path | None:
-        """The photograph at a path that the file says; None if there is none. It is then in `without_photograph`.
+        """Find the image file for a photograph's `path` in the camera file. If there is none, returns None.
 
-        `relative`: is the path relative to the folder of SRC? Raises InputError, which begins with `what`, if the path
-        may be that of several photographs.
+        The path is then added to `without_photograph`. `relative`: may the path be relative to the folder of the camera
+        file? Raises InputError if several image files match; `what` begins the message.
         """
         if relative and self.photographs is None and self.images is None and is_file(self.beside / path):
             return Path(os.path.normpath(self.beside / path))  # equal to the one in `available`
@@ -74,7 +77,10 @@ class NamedPhotographs(Source):
         return found
 
     def largest(self, models: Sequence[Sized], what: str) -> int:
-        """The index of the model with the most photographs; a note says which others are not used."""
+        """Return the index of the model with the most photographs.
+
+        Adds a note about the others; `what` names them there.
+        """
         sizes = [len(model) for model in models]
         best = sizes.index(max(sizes))
         if others := ", ".join(f"number {k + 1} ({size})" for k, size in enumerate(sizes) if k != best):
@@ -83,7 +89,7 @@ class NamedPhotographs(Source):
         return best
 
     def mask_at(self, path: str, what: str) -> Path:
-        """Find the mask for a path in the imported file: beside SRC, otherwise by its name in the folder --masks.
+        """Find the mask for a `path` in the camera file: relative to that file, else by name in the folder --masks.
 
         Raises InputError if there is none; `what` begins the message.
         """
@@ -107,7 +113,10 @@ class NamedPhotographs(Source):
         yield from frames
 
     def find_masks(self, frames: list[Frame]) -> None:
-        """Give the frames their masks: from `masks`, otherwise alpha channels, or a folder of masks beside them."""
+        """Set the mask of each frame: from the folder `masks`, else from alpha channels or a masks folder nearby.
+
+        Raises InputError if the folder `masks` lacks the mask of a photograph.
+        """
         folder, root = self.masks, self.photograph_files.root
         if folder is not None and not folder.is_dir():
             raise InputError(f"{folder}: --masks: no such folder")
@@ -147,11 +156,11 @@ class NamedPhotographs(Source):
 
 
 def counted(things: Sized, word: str) -> str:
-    """The number of things, with the word for one."""
+    """Format the number of `things` with the noun `word`, which is singular for one thing."""
     return f"{len(things)} {word}{'s' * (len(things) != 1)}"
 
 
 def few(names: Iterable[str]) -> str:
-    """The first three names, sorted, without their folders."""
+    """List for a message the first three file names in alphabetical order, without their folders."""
     some = sorted({" ".join(name_of(name).split())[:99] for name in names})
     return ", ".join(some[:3]) + (", …" if len(some) > 3 else "")

@@ -77,7 +77,10 @@ class OpenSfm(Photogrammetry):
 
 
 def opensfm_lens(given: dict[str, Any], image: Path, what: str) -> Lens:
-    """The lens of a camera. Lengths are relative to the longer side of the photograph, places to its middle."""
+    """Make the lens of an OpenSfM camera from its JSON fields `given`.
+
+    OpenSfM divides lengths by the longer side of the photograph, and measures positions from its centre.
+    """
 
     def number(name: str, default: float | None = None) -> float:
         return float(matrix(given.get(name, default), (), f"{what}.{name}"))

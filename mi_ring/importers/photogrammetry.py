@@ -20,7 +20,7 @@ EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.
 
 @dataclass(frozen=True)
 class Photogrammetry(NamedPhotographs):
-    """Base of the photogrammetry formats. Each format implements `posed`."""
+    """Base class of the photogrammetry formats. Subclasses implement `posed`."""
 
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the light relative to the camera: right, down and forward [scene units]. Default: at the lens."""
@@ -37,7 +37,10 @@ class Photogrammetry(NamedPhotographs):
             yield frame
 
     def exposures(self, frames: Sequence[Frame]) -> np.ndarray:
-        """(N,) exposures, relative to their median; 1 where nothing is known. Raises InputError if some are unknown."""
+        """Relative exposures (N,) of the frames by EXIF data, divided by their median; 1 for all if EXIF has none.
+
+        Raises InputError if only some photographs have an exposure.
+        """
         ones = np.ones(len(frames))
         if not self.exif:
             return ones
@@ -53,15 +56,15 @@ class Photogrammetry(NamedPhotographs):
 
 
 def exif_values(path: Path) -> dict[int, Any]:
-    """Exposure time, ISO and aperture in the EXIF data of an image file, by tag."""
+    """Read exposure time, ISO and aperture from the EXIF data of an image file: values by tag."""
     exif = read_as(path, "image", exif_of).get_ifd(ExifTags.IFD.Exif)
     return {tag: exif[tag] for tag in EXPOSURE if tag in exif}
 
 
 def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
-    """Exposure time · ISO / aperture² of each photograph by its EXIF data; NaN if unknown.
+    """Compute exposure time · ISO / aperture² of each photograph from its EXIF values by tag; NaN if unknown.
 
-    A value that no photograph has, such as the aperture of an old lens, is taken as the same in all.
+    A value that no photograph has, such as the aperture of an old lens, counts as equal in all.
     """
     values = np.array([[positive(exif.get(tag)) for tag in EXPOSURE] for exif in photographs]).reshape(-1, 3)
     unknown = np.isnan(values).all(0)
@@ -74,7 +77,7 @@ def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
 
 
 def positive(value: Any) -> float:
-    """A value of EXIF data as a positive number; NaN if it is none."""
+    """Convert an EXIF value to a positive float; NaN if it is anything else."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ArithmeticError, IndexError):

@@ -16,26 +16,26 @@ ASIDE = {*MASKS, "depth", "depths", "normal", "normals", "valid", "sparse"}
 
 
 def parts_of(path: str) -> list[str]:
-    """The folders and the file name in a path of any system, in lower case, without drive, `.` and `..`."""
+    """Split a path of any operating system into folders and file name, in lower case, without drive, `.` and `..`."""
     parts = re.split(r"[/\\]+", unicodedata.normalize("NFC", path).casefold())
     return [part for part in parts if part not in ("", ".", "..") and not re.fullmatch("[a-z]:", part)]
 
 
 def name_of(path: str) -> str:
-    """The file name in a path of any system."""
+    """Return the file name of a path of any operating system."""
     return re.split(r"[/\\]+", path)[-1]
 
 
 def stem_of(name: str) -> str:
-    """A name, in lower case, without its suffix."""
+    """Return a file name without its suffix, in lower case."""
     return SUFFIX.sub("", name)
 
 
 class PhotographFiles:
-    """Image files, found by the paths that another tool says.
+    """Index of image files that finds the file for a path recorded by another tool, perhaps on another computer.
 
-    Case, suffix, drive and the folders of another computer may differ. Of files with the same name, the one is found
-    whose folders agree with the path.
+    Case, suffix, drive and leading folders may differ. Among files with the same name, `find` takes the one whose
+    folders match the path.
     """
 
     def __init__(self, files: Iterable[Path], root: Path) -> None:
@@ -50,13 +50,13 @@ class PhotographFiles:
 
     @property
     def ordinary(self) -> list[Path]:
-        """The files that are no masks, depth maps or the like, by the names of their folders."""
+        """The files that, by the names of their folders, are no masks, depth maps or the like."""
         return [file for file in self.files if not ASIDE.intersection(self.folders[file][self.below :])]
 
     def find(self, path: str) -> tuple[Path | None, bool]:
-        """The file at a path, and whether its folders below `root` agree with those of the path; None if there is none.
+        """Find the file for a path. Returns (file or None, whether its folders below `root` match those of the path).
 
-        Raises InputError if the path may be that of several files.
+        Raises InputError if several files match equally well.
         """
         if not (parts := parts_of(path)):
             return None, False
@@ -94,10 +94,10 @@ def refuse_twins(
     what: str = "photograph of two cameras",
     advice: str = "give --images, the folder that the paths of the cameras begin in",
 ) -> set[str]:
-    """The paths whose file belongs to another path, for files that were found for several paths.
+    """Resolve claims of several paths to one file. Returns the paths that lose it to a path with matching folders.
 
-    `claims`: file, path, and whether the folders of both agree. Raises InputError if two paths have equal right to a
-    file. `what` it would be, and `advice`: for the message.
+    `claims`: tuples (file, path, whether their folders match). Raises InputError if two paths match a file equally
+    well; `what` (what the file would be) and `advice` are parts of the message.
     """
     by_file: dict[Path, list[tuple[str, bool]]] = defaultdict(list)
     for file, path, agrees in claims:

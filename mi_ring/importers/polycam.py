@@ -35,12 +35,12 @@ class Polycam(Photogrammetry):
 
     @property
     def corrected(self) -> str:
-        """What the names of the folders begin with: `corrected_`, or nothing."""
+        """Prefix of the folder names: "corrected_" if the export has corrected cameras, otherwise ""."""
         return "corrected_" if (self.keyframes / "corrected_cameras").is_dir() else ""
 
     @property
     def keyframes(self) -> Path:
-        """The folder of the cameras and images."""
+        """The folder that contains the folders of cameras and images."""
         return inner if (inner := self.src / "keyframes").is_dir() else self.src
 
     @property

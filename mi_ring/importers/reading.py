@@ -25,7 +25,7 @@ def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
 
 
 def pixels_of(path: Path, heed: bool = False) -> np.ndarray:
-    """Pixels (H, W, C) of an image file. `heed`: as for `images.read_image`."""
+    """Read the pixels (H, W, C) of an image file. `heed`: convert its colours, as in `images.read_image`."""
     return read_as(path, "image", lambda file: images.read_image(file, heed))
 
 
@@ -35,7 +35,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def orientation_of(path: Path) -> int:
-    """The EXIF orientation by which the pixels that we read are to be turned; 1 if there is none, and for raw files."""
+    """EXIF orientation by which pixels must be rotated after reading; 1 (none) if it is missing, and for raw files."""
     if path.suffix.lower() in (*image_headers.HEIF, *image_headers.RAW):  # HEIF's reader has turned them already
         return 1
     value = read_as(path, "image", image_headers.exif_of).get(ExifTags.Base.Orientation)
@@ -43,7 +43,7 @@ def orientation_of(path: Path) -> int:
 
 
 def has_alpha(path: Path) -> bool:
-    """Does an image file have an alpha channel that is not opaque everywhere?"""
+    """Test whether an image file has an alpha channel in which some pixel is not opaque."""
     if not read_as(path, "image", image_headers.has_alpha_channel):
         return False
     pixels = pixels_of(path)
@@ -52,26 +52,26 @@ def has_alpha(path: Path) -> bool:
 
 
 def existing(path: Path, field: str) -> Path:
-    """Return the path. Raises InputError, which names the `field`, if there is no such file."""
+    """Return `path`. Raises InputError if there is no such file; `field` names its origin in the message."""
     if not is_file(path):
         raise InputError(f"{path}: {field}: no such file")
     return path
 
 
 def first_file(candidates: list[Path], field: str) -> Path:
-    """Find the first of these files that exists. Raises InputError, which names the `field`, if none exists."""
+    """Return the first of the candidates that exists. Raises InputError if none does; `field` begins the message."""
     if file := next(filter(is_file, candidates), None):
         return file
     raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files in a folder, sorted by name, without hidden ones."""
+    """List the image files in a folder, sorted by name. Hidden files are left out."""
     return without_raw_twins(path for path in folder.glob("[!.]*") if is_image(path))
 
 
 def images_below(folder: Path) -> list[Path]:
-    """The image files in a folder and the folders below it, sorted, without hidden ones."""
+    """List the image files in a folder and its subfolders, sorted. Hidden ones are left out."""
     found = []
     for place, inner, files in os.walk(folder):
         inner[:] = [name for name in inner if not name.startswith(".")]
@@ -80,12 +80,12 @@ def images_below(folder: Path) -> list[Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Is there such a file, with a suffix of image files?"""
+    """Test whether a path is an existing file with the suffix of an image format."""
     return path.suffix.lower() in image_headers.SUFFIXES and is_file(path)
 
 
 def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
-    """The paths, sorted, without raw files and HEIC beside an image of another format with the same name."""
+    """Sort the paths. Leaves out a raw or HEIC file if another format of the same photograph is beside it."""
     found = sorted(paths)
     twins = image_headers.RAW + image_headers.HEIF
     others = {path.with_suffix("") for path in found if path.suffix.lower() not in twins}
@@ -93,13 +93,16 @@ def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
-    """List the image files in a folder by number: their name, or their index if any name is no number."""
+    """Return the image files in a folder by number: the number that is their name, else their index for all of them."""
     files = list_images(folder)
     return {int(f.stem): f for f in files} if all(f.stem.isdigit() for f in files) else dict(enumerate(files))
 
 
 def chosen(wanted: Collection[int], available: Collection[int], option: str, where: Path) -> list[int]:
-    """Sort the wanted numbers; if none is given, take all available ones. Raises InputError if one is not available."""
+    """Return the `wanted` numbers, sorted, or all `available` ones if none is wanted.
+
+    Raises InputError, which names `option` and `where`, if a wanted number is not available.
+    """
     for number in wanted:
         if number not in available:
             raise InputError(f"{option}: {number}: is not in {where}, which has {min(available)} to {max(available)}")
@@ -107,7 +110,10 @@ def chosen(wanted: Collection[int], available: Collection[int], option: str, whe
 
 
 def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert values to finite floats of this shape. Raises InputError, which begins with `what`, if impossible."""
+    """Convert `values` to an array of finite floats of this shape.
+
+    Raises InputError if impossible; `what` begins it.
+    """
     try:
         array = np.array(values, float)
     except (TypeError, ValueError, OverflowError):
@@ -122,36 +128,42 @@ def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def entry(arrays: Mapping[str, object], key: str, shape: tuple[int, ...], path: Path) -> np.ndarray:
-    """The array `key`, of this shape, in a .mat or .npz file. Raises InputError if it is missing or wrong."""
+    """Return the array `key`, of this `shape`, from the content of a .mat or .npz file.
+
+    Raises InputError, which names the file `path`, if it is missing or has another shape.
+    """
     return matrix(arrays.get(key), shape, f"{path}: {key}")
 
 
 def load_mat(path: Path) -> dict:
-    """Read the variables in a MATLAB file. A child process tries first, because damaged files crash scipy's reader."""
+    """Read all variables of a MATLAB file.
+
+    A child process reads it first, because damaged files crash scipy's reader.
+    """
     size = existing(path, "MATLAB file").stat().st_size
     require_readable("import scipy.io; scipy.io.loadmat(sys.argv[1])", path, size, "a MATLAB file")
     return read_as(path, "MATLAB file", scipy.io.loadmat)
 
 
 def load_json(path: Path) -> Any:
-    """Read the value in a JSON file."""
+    """Read a JSON file and return its value. Raises InputError if that fails."""
     return read_as(path, "JSON", lambda file: json.loads(file.read_bytes()))
 
 
 def require_object(value: Any, what: str) -> dict:
-    """Return the value. Raises InputError, which begins with `what`, if it is no JSON object."""
+    """Return `value` if it is a JSON object. Otherwise raises InputError; `what` begins the message."""
     if not isinstance(value, dict):
         raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
     return value
 
 
 def load_xml(path: Path) -> ElementTree.Element:
-    """Read the root of an XML file."""
+    """Read an XML file and return its root element. Raises InputError if that fails."""
     return read_as(path, "XML", lambda file: ElementTree.fromstring(file.read_bytes()))
 
 
 def load_lines(path: Path, others: bool = False) -> list[str]:
-    """Read the lines of a text file, without empty ones. `others`: it may be UTF-16, or Windows' Latin-1, too."""
+    """Read the lines of a text file, without empty ones. `others`: also accept UTF-16 and Windows' Latin-1."""
 
     def decoded(file: Path) -> str:
         content = file.read_bytes()

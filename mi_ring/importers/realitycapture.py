@@ -58,7 +58,7 @@ class RealityCapture(Photogrammetry):
         return self.from_sidecars() if self.src.is_dir() else self.from_csv()
 
     def from_sidecars(self) -> Iterator[Frame]:
-        """The photographs x.jpg that have a sidecar x.xmp with a pose."""
+        """Yield the photographs x.jpg beside which there is a sidecar x.xmp with a pose."""
         if not any(self.src.glob("*.xmp")):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
@@ -75,7 +75,7 @@ class RealityCapture(Photogrammetry):
         self.tell_unused(self.src, said)
 
     def from_csv(self) -> Iterator[Frame]:
-        """The photographs in the rows of a CSV file."""
+        """Yield the photographs listed in the CSV file."""
         columns, rows = read_csv(self.src)
         if missing := [name for name in ("name", *POSE, "f") if name not in columns]:
             raise InputError(f"{self.src}: column {missing[0]}: is missing; must be the table of internal and external "
@@ -99,7 +99,7 @@ class RealityCapture(Photogrammetry):
 
 
 def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
-    """Make a photograph with the camera in the `fields` of its sidecar."""
+    """Make the frame of a photograph from the `fields` of its XMP sidecar."""
 
     def numbers(name: str, count: int, default: str | None = None) -> np.ndarray:
         text = fields.get(name, default)
@@ -123,7 +123,7 @@ def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
 
 
 def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
-    """The attributes and elements in RealityCapture's namespace of an XMP file, by name."""
+    """Read RealityCapture's attributes and elements from an XMP file: text by name."""
     found: dict[str, str] = {}
     for element in root.iter():
         found |= {name: value for name, value in element.attrib.items() if name.startswith(XCR)}
@@ -133,9 +133,9 @@ def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
 
 
 def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Column names and rows of a CSV file. Its first line may be the number of cameras, which is skipped.
+    """Read a CSV file. Returns (column names, rows). A first line with the number of cameras is skipped.
 
-    Programs for tables may have saved it with semicolons or tabs, decimal commas, and in another encoding.
+    Accepts what spreadsheet programs write: semicolons or tabs, decimal commas, other encodings.
     """
     lines = [line for line in load_lines(path, others=True) if not line.startswith("#cameras")]
     separator = max(",;\t", key=lines[0].count) if lines else ","
@@ -149,10 +149,10 @@ def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def film_lens(image: Path, focal: float, centre: list[float], terms: list[float], what: str) -> Lens:
-    """Make the lens of a photograph from numbers relative to the film.
+    """Make the lens of a photograph from lengths relative to the film.
 
-    `focal`: focal length for film 36 mm wide; `centre`: principal point relative to the middle of the photograph [its
-    longer side]; `terms`: the coefficients `TERMS`.
+    `focal`: 35 mm equivalent focal length [mm]. `centre`: principal point relative to the centre of the photograph,
+    divided by its longer side. `terms`: the distortion coefficients `TERMS`.
     """
     size = image_size(image)
     longer = max(size)

@@ -77,7 +77,7 @@ class SfmData(Photogrammetry):
         yield from self.openmvg(top) if "extrinsics" in top or "root_path" in top else self.alicevision(top)
 
     def alicevision(self, top: dict) -> Iterator[Frame]:
-        """The photographs of a scene of Meshroom."""
+        """Yield the photographs in a Meshroom file, whose top-level object is `top`."""
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
         poses = self.by_key(top, "poses", "poseId")
@@ -104,7 +104,10 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[Frame]:
-        """The photographs of a scene of OpenMVG. Its library cereal names a polymorphic type only at its first use."""
+        """Yield the photographs in an OpenMVG file, whose top-level object is `top`.
+
+        Its library cereal names a polymorphic type only at the first use.
+        """
         root = str(top.get("root_path", ""))
         intrinsics, types = self.by_key(top, "intrinsics", "key"), {}
         for own in intrinsics.values():
@@ -130,39 +133,42 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, pose_of(R.T, center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
-        """Arrange the entries of the list `name` in the file by their field `key`; empty if there is no such list."""
+        """Return the entries of the list `top[name]` by their field `key`; empty if there is no such list."""
         values = top.get(name) or []
         if not isinstance(values, list):
             raise InputError(f"{self.src}: {name}: must be a list")
         return {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[Frame]:
-        """The frame of a photograph, which may have been moved; nothing if there is no such photograph."""
+        """Yield the frame of the photograph `file`, which may have moved; nothing if the photograph is not found."""
         if own := self.photograph(file, what, relative=True):
             yield Frame(own, lens, pose, said=file)
 
 
 def file_name(view: dict, field: str, what: str) -> str:
-    """The name of a view's file. Raises InputError if it is missing."""
+    """Return a view's file name from its `field`. Raises InputError if it is missing."""
     if not isinstance(view.get(field), str) or not view[field]:
         raise InputError(f"{what}: {field}: is missing; must be the name of a photograph")
     return view[field]
 
 
 def pointed_to(own: dict, what: str) -> dict:
-    """Read the object in a smart pointer of cereal, with the fields of its base class."""
+    """Return the object behind a smart pointer of cereal, together with the fields of its base class."""
     wrapper = require_object(require_object(own.get("value"), what).get("ptr_wrapper"), f"{what}: ptr_wrapper")
     data = require_object(wrapper.get("data"), f"{what}: data")
     return {**data.get("value0", {}), **data} if isinstance(data.get("value0", {}), dict) else data
 
 
 def type_number(value: dict, path: Path) -> int:
-    """The number of a polymorphic type of cereal, without the highest bit, which says that a name follows."""
+    """Return the number of a polymorphic type of cereal, without the highest bit, which means that a name follows."""
     return int(matrix(value.get("polymorphic_id"), (), f"{path}: intrinsics: polymorphic_id")) & 0x7FFFFFFF
 
 
 def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
-    """A lens of AliceVision, where pixel centres are integers. For the versions see its sfmDataIO/CHANGES.md."""
+    """Make a lens from AliceVision's fields. There, pixel centres are integers.
+
+    For the versions see sfmDataIO/CHANGES.md of AliceVision.
+    """
 
     def number(name: str, default: float | None = None) -> float:
         return float(matrix(own.get(name, default), (), f"{what}: {name}"))
@@ -189,7 +195,7 @@ def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
 
 
 def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
-    """A lens of OpenMVG, where pixel centres are integers. `kind`: name of its polymorphic type."""
+    """Make a lens from OpenMVG's fields. There, pixel centres are integers. `kind`: name of the polymorphic type."""
     focal = float(matrix(own.get("focal_length"), (), f"{what}: focal_length"))
     centre = matrix(own.get("principal_point"), (2,), f"{what}: principal_point") + 0.5
     size = matrix([own.get("width"), own.get("height")], (2,), f"{what}: width, height")

@@ -104,7 +104,10 @@ class Transforms(NamedPhotographs):
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
-    """The lens of a frame of transforms.json. `given`: the fields of the file, replaced by those of the frame."""
+    """Make the lens of a frame in transforms.json.
+
+    `given`: the fields of the file, overridden by those of the frame.
+    """
 
     def number(*names: str, default: float | None = None) -> float:
         value = next((given[name] for name in names if given.get(name) is not None), default)

@@ -13,7 +13,7 @@ AT_ONCE = 2**22  #: pixels; interpolating them takes about half a gigabyte
 
 
 class Window(NamedTuple):
-    """A part of the undistorted photograph: its place, and its scale."""
+    """A rectangular part of the undistorted photograph, and the scale at which to compute it."""
 
     left: int  #: first column [px of the photograph]
     top: int  #: first row [px of the photograph]
@@ -23,14 +23,17 @@ class Window(NamedTuple):
 
     @classmethod
     def whole(cls, lens: Lens, longest: int) -> "Window":
-        """The whole photograph, reduced so that its longer side has at most `longest` pixels."""
+        """Make a window of the whole photograph, reduced so that its longer side has at most `longest` pixels."""
         scale = -(-max(lens.size) // longest)
         return cls(0, 0, lens.size[0] // scale, lens.size[1] // scale, scale)
 
 
 @lru_cache(maxsize=1)
 def source_positions(lens: Lens, window: Window) -> np.ndarray:
-    """Find where in the photograph the window's pixels are: rows and columns (2, H, W) [px]; first pixel's centre 0."""
+    """Map each pixel of the window to its position in the distorted photograph: rows and columns (2, H, W) [px].
+
+    The centre of the first pixel is at 0.
+    """
     (fx, fy), (cx, cy) = lens.focal, lens.centre
     left, top, width, height, scale = window
     x = (left + (np.arange(width) + 0.5) * scale - cx) / fx
@@ -42,12 +45,12 @@ def source_positions(lens: Lens, window: Window) -> np.ndarray:
 def undistort(
     pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: float = 1.0, window: Window | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Undistort an image (H, W, C). Returns the pinhole image of equal intrinsics, and its valid pixels (H, W) bool.
+    """Undistort an image (H, W, C).
 
-    Linear radiance is interpolated. Pixels that the source does not show are 0 and not valid.
-    `srgb`: are the first three channels sRGB-encoded? `saturation`: encoded value (1 = full scale) from which a pixel
-    is clipped; infinite for masks. A result is clipped if any of the pixels that it interpolates is. `window`: the part
-    to compute, of scale 1; None: all.
+    Returns (pinhole image (H, W, C) with the same intrinsics, valid pixels (H, W) bool). Linear radiance is
+    interpolated. Pixels outside the source image are 0 and invalid. `srgb`: are the first three channels sRGB-encoded?
+    `saturation`: encoded value (1 = full scale) from which a pixel is clipped; infinite for masks. A result is clipped
+    if any pixel that contributes to it is. `window`: the part to compute, of scale 1; None: all.
     """
     window = window or Window(0, 0, *lens.size)
     rows = max(1, AT_ONCE // window.width)

@@ -65,7 +65,10 @@ class VisualSfm(Photogrammetry):
                 yield Frame(image, lens, pose_of(R.T, np.array([x, y, z])), said=name)
 
     def models(self, lines: list[str]) -> list[list[str]]:
-        """The lines of the cameras of each model. Each model is a number of cameras, these, and the same of points."""
+        """Split the lines of the file by model, and return the camera lines of each.
+
+        A model consists of a number of cameras and as many lines, then a number of points and as many lines.
+        """
         models, at = [], 0
 
         def count() -> int:
@@ -84,9 +87,10 @@ class VisualSfm(Photogrammetry):
 
 
 def undistorting_lens(size: tuple[int, int], intrinsics: tuple[float, ...], r: float, what: str) -> Lens:
-    """A lens with VisualSFM's radial distortion `r`; `intrinsics`: fx, fy, cx, cy [px].
+    """Make a lens that approximates VisualSFM's radial distortion `r`. `size`: (width, height) [px].
 
-    Raises InputError, which begins with `what`, if the distortion is too strong for the approximation.
+    `intrinsics`: fx, fy, cx, cy [px]. Raises InputError if the distortion is too strong for the approximation; `what`
+    begins the message.
     """
     if not r:
         return Lens("PINHOLE", size, intrinsics)

@@ -37,7 +37,7 @@ class Writer:
         self.shared: dict = {}  #: relative paths of files that several photographs share, by folder and key
 
     def write(self, file: str, write: Callable[[Path], object]) -> Path:
-        """Write a file by `write(path)`. Returns its final path."""
+        """Call `write(path)` to write a file into the temporary folder. Returns the path that the file will have."""
         path = self.staging / file
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path)
@@ -45,19 +45,22 @@ class Writer:
         return self.folder / file
 
     def image(self, file: str, pixels: np.ndarray) -> Path:
-        """Write an image, `file` without suffix: EXR for float32, else PNG. Returns its final path."""
+        """Write an image; `file`: its name without suffix. float32 becomes EXR, all else PNG.
+
+        Returns the final path.
+        """
         suffix = ".exr" if pixels.dtype == np.float32 else ".png"
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
     def relative(self, path: Path) -> Path:
-        """Make a path relative to the scene file."""
+        """Convert a path to one relative to the scene file."""
         return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
-        """Move all files to their places, then write the scene file.
+        """Move all files to their final places, then write the scene file.
 
-        Raises InputError if another file is in the place of one, because it may be a source. An equal file is from an
-        interrupted run.
+        Raises InputError if a different file is already there, because it may be a source. An identical file is left by
+        an interrupted run, and is accepted.
         """
         for file in self.files:
             place = self.folder / file
@@ -69,7 +72,7 @@ class Writer:
         write_file(self.scene, xml)
 
     def close(self) -> None:
-        """Remove the temporary folder, and new folders that are empty."""
+        """Remove the temporary folder, and folders that this writer made and left empty."""
         shutil.rmtree(self.staging, ignore_errors=True)
         for folder in self.new_folders:
             with contextlib.suppress(OSError):  # not empty
@@ -77,7 +80,10 @@ class Writer:
 
 
 def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
-    """Write the changed files of a frame, or with `copy` all of its files. Returns the files for the scene file."""
+    """Write the files of a frame that had to change; with `copy` all of them.
+
+    Returns their names for the scene file.
+    """
     straight, pixels, turn = frame.lens.is_pinhole, frame.pixels, frame.orientation
 
     def place(folder: str, key: Hashable, path: Path, changed: Callable[[], np.ndarray | None]) -> Path:

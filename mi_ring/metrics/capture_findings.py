@@ -20,21 +20,30 @@ FAR, LEAST_FAR = 4.0, 2.0  #: a camera has moved far: more than this multiple of
 
 
 def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
-    """Name photographs that a fit moved much farther than others; may be empty. Argument: see calibration.json."""
+    """Name the photographs that a fit has moved much farther than the others; empty if there are none.
+
+    `photographs`: that entry of calibration.json.
+    """
     moved = {name: entry["moved_px"] for name, entry in photographs.items()}
     limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()) or [0])))
     return ", ".join(f"{name} ({far:.1f} px)" for name, far in moved.items() if far > limit)
 
 
 def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
-    """List photographs whose light is much stronger or weaker than that of the others. See `moved_far`."""
+    """Name the photographs whose light is much stronger or weaker than in the others.
+
+    Argument and result: as `moved_far`.
+    """
     powers = {name: float(np.exp(np.log(e["power"]).mean())) for name, e in photographs.items() if "power" in e}
     odd = {name: power for name, power in powers.items() if not 1 / ODD_POWER < power < ODD_POWER}
     return ", ".join(f"{name} ({power:.2g} times)" for name, power in odd.items())
 
 
 def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
-    """Read calibration.json beside a scene file: `moved_far` and `odd_powers` of photographs; empty without it."""
+    """Read calibration.json beside a scene file. Returns (`moved_far`, `odd_powers`) for the photographs `names`.
+
+    Both are empty without this file.
+    """
     record = read_json(scene.parent / "calibration.json")
     try:
         known = {name: entry for name, entry in record["photographs"].items() if name in names}
@@ -45,7 +54,7 @@ def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
 
 @dataclass
 class PhotographQuality:
-    """The quality of one photograph: a row of the table of `mi-ring check`. Lengths are in radii of the object."""
+    """Quality measures of one photograph: a row in the table of `mi-ring check`. Lengths are in radii of the object."""
 
     name: str
     distance: float  #: from the camera to the object
@@ -74,7 +83,7 @@ agreement: share of the mask that the other masks agree with"""
 def measure(
     capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]
 ) -> list[PhotographQuality]:
-    """Measure the quality of each photograph. `agreement`: share of each mask that the others confirm, by file."""
+    """Measure the quality of each photograph. `agreement`: share of each mask that the other masks confirm, by file."""
     lights, rows = capture.photographs.lights, []
     lit = np.any(lights.rgb() > 0, axis=1)
     of_each = zip(capture.shots, capture.names, lights.toward(center), lights.distances(center),
@@ -108,7 +117,7 @@ def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
 
 
 def units(capture: Capture, center: np.ndarray) -> str | None:
-    """A sentence for the user if the lights seem to be in other units than the cameras; None otherwise."""
+    """Warn the user, in a sentence, if lights and cameras seem to have different length units; otherwise None."""
     lights, point = capture.photographs.lights.positions(), capture.photographs.lights.is_finite()
     cameras = np.stack([shot.camera.position for shot in capture.shots])
     if not point.any() or np.ptp(cameras, axis=0).max() == 0:
@@ -125,7 +134,7 @@ def units(capture: Capture, center: np.ndarray) -> str | None:
 
 
 def facing(capture: Capture, center: np.ndarray) -> str | None:
-    """A sentence for the user if cameras look away from the object; None otherwise."""
+    """Warn the user, in a sentence, if cameras face away from the object; otherwise None."""
     cameras = [shot.camera for shot in capture.shots]
     away = np.array([(center - camera.position) @ camera.forward < 0 for camera in cameras])
     if away.mean() > 0.5:
@@ -135,11 +144,10 @@ def facing(capture: Capture, center: np.ndarray) -> str | None:
 
 
 def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
-    """Lower bound of the share of room light in the light on the object; 0 if none is found.
+    """Estimate a lower bound of the share of room light in all light on the object; 0 if none is found.
 
-    `brightness` (n,): of the object in each photograph, as in `PhotographQuality`. `received` (n,): irradiance of the
-    object by the known lights. Room light does not depend on the distance of the flash, so the object looks too bright
-    where the irradiance is small.
+    `brightness` (n,): of the object in each photograph. `received` (n,): irradiance by the known lights. Room light
+    does not depend on the distance of the flash, so the object looks too bright where this irradiance is small.
     """
     if len(received) < 12 or received.max() < 1.5 * received.min():
         return 0.0
@@ -150,7 +158,7 @@ def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
 
 
 def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np.ndarray) -> list[str]:
-    """The findings about a capture: one sentence for each problem. `rows`: from `measure`."""
+    """List the problems of a capture, one sentence each. `rows`: what `measure` returned."""
     found: list[str] = []
     agree = [row.agreement for row in rows if row.agreement is not None]
     if capture.whole and agree and np.median(agree) >= CONFORMS:  # masks of bright parts only need not agree

@@ -13,7 +13,7 @@ STEP = 1e-3  #: distance from a triangle of the points on its two sides, in the 
 def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.ndarray:
     """Find triangles `faces` (F, 3) of domain points `s` (V, 3) that Shape-Net flattens or inverts: (F,) bool.
 
-    Shape-Net moves a point from the outer side of such a triangle to its inner side. For infinitely small triangles
+    Shape-Net moves a point from the outer side of such a triangle to the inner side. For infinitely small triangles
     this means det ∂Φ/∂s ≤ 0, which is impossible for an exactly solved flow.
     """
     s = s.to(ring.center.device)
@@ -30,7 +30,10 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
 
 
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Find triangles (F,) bool that cross, overlap or touch others, exactly. Raises InputError without libigl."""
+    """Find triangles that cross, overlap or touch others, in exact arithmetic: (F,) bool.
+
+    Raises InputError without libigl.
+    """
     need("igl", "the exact count of crossing triangles", "libigl")
     from igl.copyleft.cgal import remesh_self_intersections
 

@@ -19,11 +19,11 @@ WINDOW = 11  #: width of the window of SSIM [px]
 def compare_photographs(
     capture: Capture, ring: FittedObject, spp: int, index: Sequence[int] | None = None
 ) -> tuple[dict[str, float], list[dict]]:
-    """Predict photographs `index` (default: all) and compare: `psnr` [dB] and `ssim` of all, and a list by photograph.
+    """Predict photographs `index` (default: all) and compare.
 
-    Predictions have `spp` samples per pixel and are 8-bit sRGB, as `mi_ring.render` writes them. Only `comparable`
-    pixels count. The total PSNR is that of the mean squared error, the total SSIM is the mean. `psnr` is missing if the
-    prediction is exact.
+    Returns ({`psnr` [dB], `ssim`} of all, list by photograph). Predictions have `spp` samples per pixel and are 8-bit
+    sRGB, as `mi_ring.render` writes them. Only `comparable` pixels count. The total PSNR is that of the mean squared
+    error, the total SSIM is the mean. `psnr` is missing if the prediction is exact.
     """
     surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
@@ -48,18 +48,18 @@ def compare_photographs(
 
 
 def comparable(capture: Capture, seen: Observation) -> np.ndarray:
-    """Find pixels (H, W) bool of the first photograph to compare: valid, and in a lit room inside the mask, if any."""
+    """Find the pixels (H, W) bool to compare in the first photograph: valid and, in a lit room, inside the mask if any."""
     valid = np.ones(seen.mask.shape[1:], bool) if seen.valid is None else seen.valid[0].numpy()
     return valid & (seen.mask[0].numpy() > 0.99) if seen.masked[0] and capture.lit_room else valid
 
 
 def decibels(square: float) -> dict[str, float]:
-    """Convert a mean squared error of values in [0, 1] to `psnr` [dB]; empty if the error is 0."""
+    """Convert a mean squared error of values in [0, 1] to {`psnr`: PSNR [dB]}; {} if the error is 0."""
     return {"psnr": float(-10 * np.log10(square))} if square else {}
 
 
 def ssim(a: np.ndarray, b: np.ndarray, compared: np.ndarray | None = None) -> dict[str, float]:
-    """Structural similarity `ssim` of two images (H, W, 3) in [0, 1]; empty if they are smaller than the window.
+    """Structural similarity {`ssim`: value} of two images (H, W, 3) in [0, 1]; {} if they are smaller than the window.
 
     It is the mean over channels and over the pixels `compared` (H, W) bool. None: over the pixels whose window is
     inside the image. Wang et al., Image Quality Assessment, IEEE TIP 2004: Gaussian window of 11 × 11 px, σ = 1.5 px.

@@ -14,7 +14,10 @@ CONFORMS = 0.9  #: least share of a mask that the others must agree with
 
 
 def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
-    """Test whether masks agree: the share of each mask that all others contain, by file; and findings as sentences."""
+    """Test whether masks agree.
+
+    Returns (share of each mask that all others confirm, by file; problems as sentences).
+    """
     if not capture.hull:
         return {}, []
     silhouettes = capture.silhouettes()
@@ -40,7 +43,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
 
 
 def with_camera(silhouette: Silhouette, **changed: Any) -> Silhouette:
-    """A copy of a silhouette whose camera has the `changed` fields."""
+    """Return a copy of a silhouette in which the `changed` fields of the camera are replaced."""
     return silhouette._replace(camera=silhouette.camera._replace(**changed))
 
 
@@ -71,7 +74,7 @@ OTHERS = {
 
 
 def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
-    """The share of all masks' pixels that every mask agrees with; 0 if the visual hull is empty."""
+    """Share of the pixels of all masks that the visual hull covers; 0 if the hull is empty."""
     try:
         return float((Hull(silhouettes, "").shortfall(samples=48) < 1).mean())
     except InputError:
@@ -79,13 +82,13 @@ def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
 
 
 def border(silhouette: Silhouette) -> float:
-    """Share of the pixels at the edge of a photograph that its mask says are object."""
+    """Share of the pixels at the border of a photograph that are object according to the mask."""
     mask = silhouette.mask > 127
     return float(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean())
 
 
 def mistake_in_masks(silhouettes: Sequence[Silhouette]) -> dict[str, Sequence[Silhouette]]:
-    """Mistakes in the masks, as text, and the silhouettes without them."""
+    """List possible mistakes in the masks: the silhouettes with the mistake removed, by its description."""
     guesses: dict[str, Sequence[Silhouette]] = {}
     if np.median([border(silhouette) for silhouette in silhouettes]) > 0.5:  # an object is rarely all around
         guesses["masks are inverted: 255 is to be the object, 0 the background"] = [
@@ -99,7 +102,10 @@ def mistake_in_masks(silhouettes: Sequence[Silhouette]) -> dict[str, Sequence[Si
 
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
-    """Find the known mistake in the cameras that explains why masks disagree, and its correction, as text; or None."""
+    """Find a common mistake in the cameras that explains why masks disagree.
+
+    Returns its description and remedy, or None.
+    """
     some = subsample(silhouettes, 32, 96)
     limit = max(CONFORMS, share_agreed(some) + 0.05)
     masks = {name: share_agreed(subsample(guess, 32, 96)) for name, guess in mistake_in_masks(silhouettes).items()}
@@ -119,7 +125,7 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
 
 
 def half_pixel(hull: Hull) -> str | None:
-    """Test whether all principal points are wrong by half a pixel, so that masks differ from the hull: text or None."""
+    """Test whether all principal points are wrong by half a pixel. Returns a sentence, or None if they are right."""
     gaps, hull, some = dict[float, float](), copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
     silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):

@@ -23,7 +23,7 @@ LANES = 1 << 21  #: most rays in one launch
 
 @dataclass
 class Pictures:
-    """Renderings of one photograph by `photometric` and `path`: 16 independent ones each (16, H, W, 3), linear."""
+    """Renderings of one photograph by `photometric` and by `path`: 16 independent ones each, (16, H, W, 3), linear."""
 
     photometric: np.ndarray
     unshadowed: np.ndarray  #: photometric without shadows, same samples
@@ -32,7 +32,10 @@ class Pictures:
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """Load a scene that stock integrators can light, without tables, and its photographs. Raises InputError."""
+    """Load a scene, without tables, that Mitsuba's own integrators can light. Returns (scene, `photograph` sensors).
+
+    Raises InputError if the scene is not suitable.
+    """
     scene, shots = open_scene(path)
     try:
         for shape in scene.shapes():
@@ -46,7 +49,7 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
 
 
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """Change a scene so that stock integrators see the photographs' light: with exactly one `flash`, without a `room`.
+    """Return the scene with exactly one `flash` and no `room`, so that Mitsuba's own integrators see the photographs' light.
 
     A `shapenet` has a `flash` already. Raises SceneError if there are several.
     """
@@ -93,7 +96,7 @@ def render_both(
 def render_path(
     scene: mi.Scene, photographs: Photographs, sensor: Any, spp: int, seed: int, depth: int
 ) -> list[mi.Float]:
-    """Render photographs by Mitsuba's `path`: [R, G, B]. All selected photographs must be the one of `sensor`."""
+    """Render a photograph by Mitsuba's `path`: [R, G, B]. All selected photographs must be the one of `sensor`."""
     photograph.Photograph.current = sensor
     ray, _ = pixel_rays(photographs, spp, seed)
     ray.time = photograph.SHUTTER

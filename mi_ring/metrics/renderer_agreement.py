@@ -17,7 +17,10 @@ IMPLAUSIBLE = 0.75  #: share of interreflection above which the intensities are 
 
 @dataclass
 class Comparison:
-    """Differences of `photometric` and `path` in one photograph or all. Shares are of the mean radiance of `path`."""
+    """Differences between `photometric` and `path` in one photograph or all.
+
+    Shares are of the mean radiance of `path`.
+    """
 
     name: str
     radiance: float  #: mean of `path` over all pixels and channels
@@ -59,7 +62,10 @@ def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def blocks(x: np.ndarray) -> np.ndarray:
-    """Sum pictures (16, H, W, 3) over blocks of pixels, each in one channel: (16, h, w). Border blocks are smaller."""
+    """Sum pictures (16, H, W, 3) over pixel blocks, using one channel per block: (16, h, w).
+
+    Border blocks are smaller.
+    """
     _, height, width, _ = x.shape
     x = np.pad(x, ((0, 0), (0, -height % BLOCK), (0, -width % BLOCK), (0, 0)))
     x = x.reshape(len(x), x.shape[1] // BLOCK, BLOCK, -1, BLOCK, 3).sum((2, 4))

@@ -26,9 +26,9 @@ THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
 
 
 def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
-    """A mesh file, and a scene of this mesh only, with smooth normals. Raises InputError if it cannot be read.
+    """Read a mesh file. Returns (mesh, scene with only this mesh and smooth normals).
 
-    A mesh that is inside out is turned, with a word on standard error.
+    Raises InputError if reading fails. A mesh that is inside out is inverted, with a message on standard error.
     """
     mesh = read_mesh(path, "mesh")
     if not len(mesh.faces):
@@ -41,7 +41,7 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 
 def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
-    """Find the rigid motion, or the `similarity`, that aligns a mesh with a mesh `onto` nearby: (4, 4).
+    """Estimate the transform (4, 4) that aligns `mesh` with the nearby mesh `onto`: rigid, or with scale if `similarity`.
 
     Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because parts of `onto` may be missing.
     """
@@ -67,7 +67,10 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Trace the pixel centres of a photograph with P pixels: is it a hit, distance, normal (P, 3), back of a face?"""
+    """Trace rays through the P pixel centres of a photograph.
+
+    Returns (hit (P,) bool, distance (P,), normal (P, 3), whether the back of a face was hit (P,) bool).
+    """
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
     camera = photograph.camera(mi.UInt32(0))
@@ -83,10 +86,10 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
 def compare_surfaces(
     capture: Capture, guess: mi.Scene, truth: mi.Scene, diagonal: float
 ) -> tuple[dict[str, float], list[dict]]:
-    """Compare two surfaces in all photographs: errors of all views together, and a list by view.
+    """Compare two surfaces in all photographs. Returns (errors over all views by name, list of errors by view).
 
     Errors are of shading normals [deg], depths [% of `diagonal`] and silhouettes. Normals and depths count at pixels
-    that see both surfaces. `iou`: mean over views; `flipped`: share of the pixels of `guess` that see the back of a
+    that see both surfaces. `iou`: mean over views. `flipped`: share of the pixels of `guess` that see the back of a
     face.
     """
     angles, depths, views, backs, pixels = [], [], [], 0, 0
@@ -139,7 +142,7 @@ def compare_shapes(
 def distances(
     start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
-    """Distances (n,) of random points of `start` to `end`. With `views`, only of points that a view shows."""
+    """Distances (n,) of random points on `start` to `end`. With `views`, only of points that a view shows."""
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:
         points = points[Visibility(start.vertices, start.faces, views).of_points(points, start.face_normals[faces])]

@@ -32,7 +32,7 @@ MIN_RADIANCE = 1e-3  #: lower radiance counts as this
 
 
 class RefinementSettings(NamedTuple):
-    """How `refine_masks` works: agreement that the vote needs, width of GrabCut's band, number of rounds."""
+    """Settings of `refine_masks`: agreement that the vote needs, width of GrabCut's band, number of rounds."""
 
     agreement: float  #: share of the masks that must contain a voxel
     band: float  #: width of the band around the silhouette in which GrabCut decides [object's size]
@@ -72,7 +72,7 @@ class VoxelObject:
 
 
 class VoxelGrid:
-    """A cube of voxels around `center` (3,), with edges of 2 `half_size`, and the views that see it."""
+    """A cube of voxels around `center` (3,), with edges of length 2 · `half_size`, and the views that see it."""
 
     def __init__(self, views: Views, center: np.ndarray, half_size: float) -> None:
         self.views, self.center, self.half_size = views, center, half_size
@@ -88,7 +88,7 @@ class VoxelGrid:
 
     @classmethod
     def seen_by(cls, views: Views) -> "VoxelGrid":
-        """Make a grid around the point that the cameras look at. It fills the median photograph."""
+        """Make a grid around the point that the cameras look at, so large that it fills the median photograph."""
         cameras = [view.camera for view in views]
         origins = np.stack([camera.position for camera in cameras])
         center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), "cameras")
@@ -97,12 +97,12 @@ class VoxelGrid:
 
     @classmethod
     def around(cls, views: Views, found: VoxelObject) -> "VoxelGrid":
-        """Make a grid around an object, a little larger than the object."""
+        """Make a grid that is a little larger than the object `found`, around it."""
         low, high = found.points.min(0), found.points.max(0)
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
     def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
-        """Find the largest connected piece of the voxels that most masks contain; None if it is too small.
+        """Find the object: the largest connected component of voxels that most masks contain. None if it is too small.
 
         `agreement`: share of the masks that must contain a voxel. `voters`: which masks vote; None: all.
         """
@@ -129,13 +129,16 @@ def empty_masks(views: Views) -> list[np.ndarray]:
 
 
 def bright_mask(view: ReducedView) -> np.ndarray:
-    """Mask what is near the flash: (H, W) uint8, 1 where log radiance is above Otsu's threshold."""
+    """Mask (H, W) uint8 of pixels that are near the flash: 1 where log radiance is above Otsu's threshold."""
     log = np.log(np.maximum(view.linear.max(-1), MIN_RADIANCE))
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
 def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
-    """Test whether each mask is complete: it misses about as little of its common silhouette as the other masks."""
+    """Test for each view whether the mask is complete, compared with the silhouette of the common object.
+
+    A mask is complete if it misses about as little of the silhouette as the other masks do.
+    """
     missing = [
         (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
         for view, mask, silhouette in zip(views, masks, silhouettes)
@@ -144,7 +147,7 @@ def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
 
 
 class Segmentation(NamedTuple):
-    """The result of `refine_masks`: the object, and its mask in each view."""
+    """Result of `refine_masks`: the object as voxels, and the mask in each view."""
 
     masks: list[np.ndarray]  #: (H, W) uint8, 1 the object
     object: VoxelObject
@@ -154,9 +157,10 @@ class Segmentation(NamedTuple):
 def refine_masks(
     grid: VoxelGrid, guesses: Masks, backgrounds: Masks, progress: Progress, settings: RefinementSettings = LOCATION
 ) -> Segmentation | None:  # fmt: skip
-    """Refine guessed masks by the vote and GrabCut in turn; None if the guesses disagree.
+    """Refine masks by alternating between the vote of all views and GrabCut in each. None if the guesses disagree.
 
-    `guesses`, `backgrounds` (H, W): of each view, above 0 on the guessed object, and where the object surely is not.
+    `guesses` (H, W) of each view: above 0 on the guessed object. `backgrounds` (H, W) of each view: above 0 where the
+    object certainly is not.
     """
 
     def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -190,7 +194,7 @@ def disputed_pixels(mask: np.ndarray, silhouette: np.ndarray, tolerance: float) 
 
 
 def touching_pixels(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Mark pieces of the guess that touch the mask from outside, such as a rod that holds the object: (H, W) uint8."""
+    """Find parts of `guess` that touch the mask from outside, such as a rod that holds the object: (H, W) uint8."""
     labels, _ = pieces((guess > 0) & (mask == 0))
     touching = np.unique(labels[cv2.dilate(mask, disk(2)) > 0])
     return np.isin(labels, touching[touching > 0]).astype(np.uint8)

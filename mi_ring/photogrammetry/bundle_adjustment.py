@@ -22,7 +22,7 @@ ITERATIONS = 10  #: of the solver per call; a call of pycolmap cannot be interru
 
 
 def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, progress: Progress) -> Any:
-    """Adjust cameras and points of a model. The sheet's corners are used unless they contradict the features."""
+    """Bundle-adjust a model, and return it. The sheet's corners are used unless they contradict the image features."""
     model.tear_down()  # covariances are refused if an image has no pose
     list(progress(robust_adjustment(model), "bundle adjustment"))
     held = pycolmap.Reconstruction(model)
@@ -39,7 +39,7 @@ def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, prog
 
 
 def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections) -> list[int]:
-    """Add each corner of the sheet to a model as `CORNER_WEIGHT` points. Returns the ids of these points."""
+    """Add the sheet's corners to a model, each as `CORNER_WEIGHT` equal points. Returns the ids of these points."""
     seen: dict[int, list[tuple[Any, np.ndarray]]] = {}
     for image, picture, scale in registered(model, pictures):
         if detection := detections.get(picture.name):
@@ -57,7 +57,7 @@ def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections)
 
 
 def robust_adjustment(model: Any) -> Iterator[None]:
-    """Adjust a model with a robust loss and remove outliers. Yields before each call of the solver."""
+    """Bundle-adjust a model with a robust loss, and remove outliers. Yields before each call of the solver."""
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
         yield from solve(model, *adjustment_problem(model), 100 // ITERATIONS)
@@ -66,7 +66,7 @@ def robust_adjustment(model: Any) -> Iterator[None]:
 
 
 def adjustment_problem(model: Any) -> tuple[Any, Any]:
-    """Make options and configuration of a bundle adjustment of all images of a model, with a robust loss."""
+    """Return (options, configuration) of a bundle adjustment of all images of a model, with a robust loss."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.solver_options.function_tolerance = CONVERGED
@@ -88,7 +88,7 @@ def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
 
 
 def refine_principal_points(model: Any, progress: Progress) -> Any:
-    """Refine the principal points of a model. A lens whose principal point is not well determined keeps its own."""
+    """Refine the principal points of a model, and return it. Points that are poorly determined keep their values."""
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
     fixed: set[int] = set()
     while fixed < lenses:
@@ -108,7 +108,10 @@ def refine_principal_points(model: Any, progress: Progress) -> Any:
 
 
 def is_determined(camera: Any, covariance: Any) -> bool:
-    """Is a camera's principal point well determined? `covariance`: a `pycolmap.BACovariance`, or None if it failed."""
+    """Test whether the principal point of a camera is well determined.
+
+    `covariance`: a `pycolmap.BACovariance`; None if it could not be computed.
+    """
     own = covariance and covariance.get_other_params_cov(camera.params)
     if own is None:
         return False
@@ -117,7 +120,10 @@ def is_determined(camera: Any, covariance: Any) -> bool:
 
 
 def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, Picture, int]]:
-    """List the images with a pose: each with its photograph, and the factor by which the photograph is larger."""
+    """Yield (image, photograph, factor) for each image with a pose.
+
+    The photograph is `factor` times as large as the image.
+    """
     by_file = {grey_file(picture): picture for picture in pictures}
     for image in [model.images[k] for k in model.reg_image_ids()]:
         camera, picture = model.cameras[image.camera_id], by_file[image.name]
@@ -125,7 +131,7 @@ def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, P
 
 
 def model_cameras(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
-    """The lens and the camera-to-world pose (4, 4) of each photograph with a pose, by the photograph's name."""
+    """Return (lens, camera-to-world pose (4, 4)) of each photograph with a pose, by the photograph's name."""
     cameras = {}
     for image, picture, scale in registered(model, pictures):
         f, cx, cy, radial = model.cameras[image.camera_id].params

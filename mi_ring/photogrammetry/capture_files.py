@@ -91,7 +91,10 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
 def write_table(
     writer: Writer, pictures: Sequence[PosedPicture], plane: Plane, center: np.ndarray, flash: FlashCalibration
 ) -> list[Element]:
-    """Write the table's albedo around `center` (3,). Returns its XML element, or [] if no photograph shows it."""
+    """Write a texture of the table's albedo around `center` (3,).
+
+    Returns [XML element], or [] if no photograph shows it.
+    """
 
     def observe(posed: PosedPicture) -> tuple[ReducedView, np.ndarray, Light]:
         view = reduce_photograph(posed.picture, posed.lens, posed.pose, Window.whole(posed.lens, TABLE_PIXELS))
@@ -115,7 +118,10 @@ def write_table(
 
 
 def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
-    """The lowest and highest column and row of the object, (2, 2) [px of the photograph]; None if the mask is empty."""
+    """Return the object's lowest and highest (column, row): (2, 2) [px of the photograph]. None if the mask is empty.
+
+    `size`: (width, height) [px] of the photograph.
+    """
     rows, columns = np.nonzero(mask == OBJECT)
     if not len(rows):
         return None
@@ -123,12 +129,12 @@ def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
 
 
 def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:
-    """The factor by which a photograph of `size` (width, height) [px] is larger than its mask."""
+    """Factor by which a photograph of `size` (width, height) [px] is larger than its mask."""
     return round(size[0] / mask.shape[1])
 
 
 def crop_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndarray:
-    """Crop a mask, enlarged to the photograph's `size` (width, height), to a window: `OBJECT`, `UNKNOWN` or 0."""
+    """Enlarge a mask to the photograph's `size` (width, height) and crop it to a window: `OBJECT`, `UNKNOWN` or 0."""
     scale, (left, top, width, height) = reduction(mask, size), window[:4]
     to_mask = np.array([[1, 0, left + (1 - scale) / 2], [0, 1, top + (1 - scale) / 2]]) / scale
     is_object, is_unknown = (

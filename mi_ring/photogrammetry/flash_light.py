@@ -27,13 +27,13 @@ OTHER_MATERIAL = 0.1  #: the margin is not paper if its log intensity differs fr
 
 
 class ObjectSphere(NamedTuple):
-    """A sphere that stands for the object: it reflects light to the paper and blocks the room's light."""
+    """A sphere that approximates the object: it reflects light onto the paper and blocks room light."""
 
     center: np.ndarray  #: (3,)
     radius: float
 
     def reflected(self, points: np.ndarray, lights: np.ndarray) -> np.ndarray:
-        """Irradiance (n,) of `points` (n, 3) of the sheet by a white sphere, lit by `lights` (n, 3) of intensity 1."""
+        """Irradiance (n,) that a white sphere reflects to `points` (n, 3), lit by `lights` (n, 3) of intensity 1."""
         up, to_light = self.center - points, lights - self.center
         distance = np.linalg.norm(to_light, axis=1)
         phase = np.arccos(np.clip(-(up * to_light).sum(1) / (np.linalg.norm(up, axis=1) * distance), -1, 1))
@@ -48,7 +48,7 @@ class ObjectSphere(NamedTuple):
 
 
 class FlashCalibration(NamedTuple):
-    """The flash, the room's light and the camera's response, in the sheet's frame [mm]. Camera axes are OpenCV's."""
+    """Estimated flash, room light and camera response, in the sheet's frame [mm]. Camera axes are OpenCV's."""
 
     offset: np.ndarray  #: (3,) position of the flash relative to the lens, in the axes of `turn_with_cameras` [mm]
     falloff: float  #: exponent of the cone: intensity is proportional to cosine ^ falloff, from the optical axis
@@ -59,15 +59,15 @@ class FlashCalibration(NamedTuple):
 
     @property
     def ambient(self) -> np.ndarray:
-        """Radiance (3,) of the room at the median exposure, if it is uniform."""
+        """Radiance (3,) of uniform room light, at the median exposure."""
         return self.room / np.pi * self.power
 
 
 def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, falloff: float) -> np.ndarray:
-    """Irradiance (n,) of n surface points by a flash of intensity 1; 0 if the light is behind the surface.
+    """Irradiance (n,) at n surface points from a flash of intensity 1; 0 where the flash is behind the surface.
 
-    `to_light` (n, 3): vectors from the points to the flash; `normal` (3,): of the surface; `forward` (3,) or (n, 3):
-    axis of the flash; `falloff`: exponent of its cone.
+    `to_light` (n, 3): vectors from the points to the flash. `normal` (3,): surface normal. `forward` (3,) or (n, 3):
+    axis of the flash. `falloff`: exponent of the cosine about this axis.
     """
     distance = np.linalg.norm(to_light, axis=1)
     cosine = np.maximum(-(to_light * forward).sum(1) / distance, MIN_FLASH_COSINE)
@@ -75,7 +75,7 @@ def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, fa
 
 
 class Observations(NamedTuple):
-    """n samples of white paper, each with its camera."""
+    """n samples of white paper, each with its camera pose and exposure."""
 
     points: np.ndarray  #: (n, 3)
     colours: np.ndarray  #: (n, 3) logarithms
@@ -95,7 +95,7 @@ class FlashParameters(NamedTuple):
     power: np.ndarray  #: logarithms
 
     def intensities(self, seen: Observations, sphere: ObjectSphere | None) -> np.ndarray:
-        """Log intensities (n, 3) of the flash, one computed from each sample of `seen`."""
+        """Log intensity (n, 3) of the flash, computed from each of the n samples `seen` alone."""
         to_light, room = seen.poses[:, :3, 3] + seen.axes @ self.offset - seen.points, self.room
         light = irradiance(to_light, np.array([0.0, 0, 1]), seen.poses[:, :3, 2], self.falloff)[:, None]
         if sphere:
@@ -108,10 +108,11 @@ def calibrate_flash(
     papers: Mapping[str, PaperSamples], poses: Mapping[str, np.ndarray], axes: Mapping[str, np.ndarray],
     exposures: Mapping[str, float], offset: np.ndarray, sphere: ObjectSphere | None = None, curved: bool = True,
 ) -> FlashCalibration | None:  # fmt: skip
-    """Calibrate the flash by the brightness of white paper; None if no photograph shows the paper.
+    """Calibrate the flash from the brightness of white paper. None if no photograph shows the paper.
 
     By the photograph's name: `papers`; `poses` (4, 4); `axes` (3, 3), see `turn_with_cameras`; relative `exposures`,
-    NaN if unknown. `offset` (3,): approximate position of the flash. `curved`: also estimate the camera's response.
+    NaN if unknown. `offset` (3,): approximate flash position relative to the camera. `curved`: also estimate the
+    camera's response.
 
     Robust least squares of log brightness, with the priors above, estimates the `FlashParameters` and each photograph's
     intensity. The margin is used only if it is as bright as the squares. A nearly linear response is taken as linear.
@@ -148,9 +149,10 @@ def fit_parameters(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], offset: np.ndarray,
     sphere: ObjectSphere | None, curved: bool,
 ) -> FlashParameters:  # fmt: skip
-    """Fit the shared unknowns to at most `MAX_PHOTOGRAPHS` photographs. Arguments: see `calibrate_flash`.
+    """Estimate the unknowns that photographs share, from at most `MAX_PHOTOGRAPHS`.
 
-    `prior`: log exposures (count,) of the photographs, and their standard deviations (count,).
+    Other arguments: see `calibrate_flash`. `prior`: (log exposures (count,) of the photographs, their standard
+    deviations (count,)).
     """
     some = evenly_spaced(len(observations), MAX_PHOTOGRAPHS)
     exposures, deviations = (part[some, None] for part in prior)
@@ -190,7 +192,7 @@ def fit_intensities(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], parameters: FlashParameters,
     sphere: ObjectSphere | None,
 ) -> np.ndarray:  # fmt: skip
-    """Fit robust log intensities (count, 3) of the flash in each photograph. `prior`: see `fit_parameters`."""
+    """Estimate log intensities (count, 3) of the flash in each photograph, robustly. `prior`: see `fit_parameters`."""
     result = []
     for seen, exposure, deviation in zip(observations, *prior):
         single, expected = parameters.intensities(seen, sphere), exposure + parameters.power

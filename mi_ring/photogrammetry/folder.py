@@ -53,7 +53,7 @@ class Picture:
         return oriented(self.stored(), self.orientation)
 
     def stored(self) -> np.ndarray:
-        """The pixels as the file stores them, before they are turned upright."""
+        """Pixels as the file stores them, not yet rotated upright."""
         pixels = read_as(self.path, "photograph", partial(read_image, heed=True))
         if pixels.dtype == np.float32:
             if not np.isfinite(pixels).all():
@@ -63,11 +63,14 @@ class Picture:
 
     @property
     def mask_pixels(self) -> np.ndarray:
-        """(H, W) uint8: the mask in this file, as stored or turned as `pixels`."""
+        """Read this file as a mask (H, W) uint8; rotated upright if `pixels` are."""
         return oriented(mask_values(read_as(self.path, "mask", read_image)), self.orientation)
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
-        """Call `read` on the opened file: by LibRaw if it is raw, otherwise by Pillow, which turns HEIF upright."""
+        """Open the file and return `read(opened)`.
+
+        Raw files are opened by LibRaw, others by Pillow, which rotates HEIF upright.
+        """
         raw = self.suffix in RAW
         with (
             reading(self.path, f"{'raw' if raw else 'HEIF'} photograph"),
@@ -77,7 +80,7 @@ class Picture:
 
     @cached_property
     def camera_orientation(self) -> int:
-        """How the camera was held, as an EXIF orientation. In HEIF files the pixels are turned already."""
+        """EXIF orientation in which the camera was held. HEIF pixels are already rotated by it."""
         if self.suffix in HEIF:
             return self.decode(lambda image: image.info.get("original_orientation") or 1)
         if self.suffix in RAW:
@@ -87,7 +90,7 @@ class Picture:
 
     @property
     def orientation(self) -> int:
-        """The EXIF orientation by which `stored` is turned: 1 for HEIF, whose reader has turned the pixels already."""
+        """EXIF orientation by which `stored` must be rotated; 1 (none) for HEIF, which is already rotated when read."""
         return self.camera_orientation if self.upright and self.suffix not in HEIF else 1
 
     @property
@@ -104,17 +107,17 @@ class Picture:
             return Image.Exif()
 
     def exif_field(self, tag: int) -> Any:
-        """The value of a tag in the Exif part of EXIF data; None if it is missing."""
+        """Value of the tag number `tag` in the Exif part of the EXIF data; None if missing."""
         return self.exif.get_ifd(ExifTags.IFD.Exif).get(tag)
 
     @property
     def raw(self) -> bool:
-        """Is it a raw file, linear and of arbitrary brightness?"""
+        """Test whether it is a raw file: linear pixels of arbitrary brightness."""
         return self.suffix in RAW
 
     @cached_property
     def encoding(self) -> Encoding:
-        """`linear` or `srgb`: the encoding of `pixels`. What the file says counts; otherwise 8 bits are sRGB."""
+        """Encoding of `pixels`: `linear` or `srgb`. If the file does not declare it, 8 bits are sRGB."""
         return read_as(self.path, "photograph", encoding_of)
 
     @cached_property
@@ -141,21 +144,21 @@ class Picture:
 
     @cached_property
     def white(self) -> float:
-        """The value of raw pixels that is shown as white (1 = full scale), because their brightness is arbitrary."""
+        """Raw value that is displayed as white (1 = full scale), because the brightness of raw files is arbitrary."""
         if not self.raw:
             return 1.0
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
     def to_linear(self, pixels: np.ndarray) -> np.ndarray:
-        """Linear radiance (H, W, 3) float32 of a part of `pixels` without alpha; 1.0 = full scale."""
+        """Convert a part of `pixels` without alpha to linear radiance (H, W, 3) float32; 1.0 = full scale."""
         value = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=np.float32) / np.iinfo(pixels.dtype).max
         return (value if self.encoding == "linear" else srgb_to_linear(value))[pixels]
 
     def mask(self, source: str | Path) -> np.ndarray | None:
-        """The user's mask (H, W) uint8, 255 on the object; None if this photograph has none.
+        """Read the user's mask (H, W) uint8, 255 on the object; None if this photograph has none.
 
-        `source`: "alpha" takes the alpha channel, "rembg" calls that package; otherwise a folder of masks, see
-        `mask_file`. Raises InputError if the mask cannot be read or has another size.
+        `source`: "alpha": take the alpha channel; "rembg": call that package; else a folder of masks, see `mask_file`.
+        Raises InputError if the mask cannot be read or differs in size.
         """
         if source == "rembg":
             return np.array(rembg()(Image.fromarray(self.srgb())))
@@ -173,25 +176,25 @@ class Picture:
         return (mask // (np.iinfo(mask.dtype).max // 255)).astype(np.uint8)
 
     def mask_file(self, folder: Path) -> Path | None:
-        """The file in a folder that is named after this photograph; None if there is none."""
+        """Find the mask file in `folder` that is named after this photograph; None if there is none."""
         suffixes = [own for suffix in (".png", *SUFFIXES) for own in (suffix, suffix.upper())]
         files = (folder / f"{name}{suffix}" for name in (self.path.name, self.name) for suffix in suffixes)
         return next((file for file in files if file.is_file()), None)
 
     def close(self) -> None:
-        """Free the memory of the pixels."""
+        """Drop cached pixels to free memory."""
         self.__dict__.pop("pixels", None)
 
 
 @cache
 def rembg() -> Callable[[Image.Image], Image.Image]:
-    """rembg's function that makes masks, with its network loaded. Raises InputError if rembg is not installed."""
+    """Load rembg's network and return its mask function. Raises InputError if rembg is not installed."""
     package = need("rembg", "--masks rembg")
     return partial(package.remove, session=package.new_session(), only_mask=True)
 
 
 def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
-    """Give a vector that is fixed to the camera in the axes of each photograph's pixels, by the photograph's name.
+    """Convert a vector that is fixed to the camera body to the pixel axes of each photograph: vectors by name.
 
     `vector`: (3,), or (3, n) for n vectors, in the axes of upright photographs with the most frequent orientation.
     """
@@ -200,12 +203,12 @@ def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[s
 
 
 def up_directions(pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
-    """The up direction (3,) of each photograph when shown upright, in the axes of its pixels; by its name."""
+    """Up direction (3,) of each photograph when displayed upright, in its own pixel axes; by the photograph's name."""
     return {p.name: p.axes @ orientation_axes(p.camera_orientation).T @ [0, -1, 0] for p in pictures}
 
 
 def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
-    """The photographs in a folder, sorted by name. `upright`: see `Picture`.
+    """List the photographs in a folder, sorted by name. `upright`: see `Picture`.
 
     Raises InputError if the folder is missing, if a name cannot be used, or if photographs are too few or identical.
     """
@@ -241,31 +244,31 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
 
 
 def focal_35mm(pictures: Sequence[Picture]) -> float | None:
-    """The first focal length [mm] in EXIF data, for film 36 mm wide; None if no photograph has one."""
+    """Find the 35 mm equivalent focal length [mm]: the first in EXIF data; None if no photograph has one."""
     values = (picture.exif_field(ExifTags.Base.FocalLengthIn35mmFilm) for picture in pictures)
     return next((float(value) for value in values if isinstance(value, int | float) and value > 0), None)
 
 
 def without_exposure(pictures: Sequence[Picture]) -> list[str]:
-    """File names of the photographs without an exposure in EXIF data; empty if no photograph has one."""
+    """List the file names of photographs that lack an exposure in EXIF data; empty if all lack it."""
     missing = [p.path.name for p, exposure in zip(pictures, exif_exposures(pictures)) if np.isnan(exposure)]
     return missing if len(missing) < len(pictures) else []
 
 
 def exif_exposures(pictures: Sequence[Picture]) -> np.ndarray:
-    """(N,) exposure time · ISO / aperture² by EXIF, without what no photograph has; NaN if unknown."""
+    """Compute exposure time · ISO / aperture² (N,) from EXIF data; NaN if unknown. A tag that all lack is left out."""
     return np.array(exposures_of([picture.exif.get_ifd(ExifTags.IFD.Exif) for picture in pictures]))
 
 
 def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.ndarray:
-    """(N,) exposures by EXIF, relative to their median; the value `unknown` where EXIF has none."""
+    """Exposures (N,) by EXIF data, divided by their median. Photographs without one get the value `unknown`."""
     exposures = exif_exposures(pictures)
     known = np.isfinite(exposures)
     return np.where(known, exposures / np.median(exposures[known]) if known.any() else 1.0, unknown)
 
 
 def without_flash(pictures: Sequence[Picture]) -> list[str]:
-    """Name the files of photographs whose flash did not fire, by EXIF; empty unless it fired in most photographs."""
+    """List the files of photographs whose flash did not fire, by EXIF data; empty unless it fired in most of them."""
     fired = [picture.exif_field(ExifTags.Base.Flash) for picture in pictures]
     off = [p.path.name for p, value in zip(pictures, fired) if isinstance(value, int) and not value & 1]
     return off if sum(isinstance(value, int) and value & 1 for value in fired) > len(pictures) / 2 else []

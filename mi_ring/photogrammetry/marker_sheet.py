@@ -52,7 +52,7 @@ Cameras = Mapping[str, tuple[Lens, Pose]]  #: by the photograph's name
 
 
 class Similarity(NamedTuple):
-    """The map x ↦ scale · rotation x + shift from the cameras' frame to the sheet's [mm], and its quality."""
+    """The similarity x ↦ scale · rotation x + shift from the cameras' frame to the sheet's frame [mm], and its quality."""
 
     scale: float
     rotation: np.ndarray  #: (3, 3)
@@ -68,7 +68,7 @@ def charuco() -> cv2.aruco.CharucoBoard:
 
 
 def page(paper: Literal["a4", "letter"]) -> Image.Image:
-    """Draw the sheet to print, in black and white, with `DOTS` per mm and a line that says what to measure."""
+    """Draw the sheet for printing, with `DOTS` pixels per mm and a line that says what to measure."""
     size = DOTS * SQUARE * np.array([COLUMNS, ROWS])
     sheet = Image.new("1", (round(DOTS * PAPERS[paper][0]), round(DOTS * PAPERS[paper][1])), 1)
     left, top = ((np.array(sheet.size) - size) // 2).tolist()
@@ -79,7 +79,7 @@ def page(paper: Literal["a4", "letter"]) -> Image.Image:
 
 
 class MarkerSheet:
-    """The printed sheet. `square`: side of its squares [mm]."""
+    """The printed sheet. `square`: side length of the squares [mm]."""
 
     def __init__(self, square: float = SQUARE) -> None:
         self.square = square
@@ -116,7 +116,7 @@ class MarkerSheet:
         return SheetDetection(ids, points, pixels)
 
     def pitch(self, points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Shorter sides (n,) [px] of the squares at n corners, by their `points` (n, 3) and `pixels` (n, 2)."""
+        """Shorter side (n,) [px] of the square at each of n corners. `points` (n, 3): on the sheet; `pixels` (n, 2)."""
         plane, _ = cv2.findHomography(points[:, :2], pixels, cv2.RANSAC, 0.05 * np.ptp(pixels, 0).max())
         if plane is None:
             return np.zeros(len(points))
@@ -128,16 +128,16 @@ class MarkerSheet:
 
 
 def are_collinear(points: np.ndarray) -> bool:
-    """Are points (n, 3) nearly on one line?"""
+    """Test whether points (n, 3) are nearly on one line."""
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(values[1] <= 0.01 * values[0])
 
 
 def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict[str, Pose], dict[str, float]]:
-    """Calibrate photographs of one `size` (width, height) by the sheet alone: lens, poses [mm], rms errors [px].
+    """Calibrate photographs of one `size` (width, height) [px] by the sheet alone.
 
-    The lens is SIMPLE_RADIAL, with the principal point in the middle. Photographs that do not fit are left out. Raises
-    InputError if fewer than three fit.
+    Returns (lens, poses [mm] by name, RMS reprojection errors [px] by name). The lens is SIMPLE_RADIAL with a central
+    principal point. Photographs that do not fit are left out. Raises InputError if fewer than three fit.
     """
     names = list(detections)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT
@@ -164,7 +164,10 @@ def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict
 
 
 def align(detections: Detections, cameras: Cameras) -> Similarity:
-    """Find the similarity from the cameras' frame to the sheet's. Raises InputError if too few corners fit."""
+    """Estimate the similarity from the cameras' frame to the sheet's frame.
+
+    Raises InputError if too few corners fit.
+    """
     seen = np.array([pair for _, *pair in triangulate(detections, cameras)]).reshape(-1, 2, 3)
     found, true = seen[:, 0], seen[:, 1]
     if len(found) < MIN_CORNERS or are_collinear(true):
@@ -185,7 +188,7 @@ def align(detections: Detections, cameras: Cameras) -> Similarity:
 
 
 def triangulate(detections: Detections, cameras: Cameras) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Triangulate the corners: of each its id, point (3,) in the cameras' frame, and point (3,) on the sheet [mm]."""
+    """Triangulate the sheet's corners. Yields (id, point (3,) in the cameras' frame, point (3,) on the sheet [mm])."""
     options = pycolmap.EstimateTriangulationOptions(min_tri_angle=MIN_PARALLAX)
     options.ransac.random_seed = 0
     seen: dict[int, list[tuple]] = {}
@@ -214,9 +217,9 @@ class PaperSamples(NamedTuple):
 def sample_paper(
     photograph: np.ndarray, detection: SheetDetection, linear: Callable[[np.ndarray], np.ndarray] = np.asarray
 ) -> PaperSamples:
-    """Sample white squares and the margin in a photograph (H, W, 3): median colours, none above `CLIPPED`.
+    """Sample the white squares and the margin in a photograph (H, W, 3): median colours, none above `CLIPPED`.
 
-    `linear` makes a part of the photograph linear, float32. All of it would take too much memory.
+    `linear`: function that decodes a part of the photograph to linear float32. Decoding all would need too much memory.
     """
 
     def sample(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
@@ -252,9 +255,9 @@ def sample_paper(
 def sample_colours(
     photograph: np.ndarray, linear: Callable[[np.ndarray], np.ndarray], points: np.ndarray, plane: np.ndarray
 ) -> np.ndarray:
-    """Sample a photograph (H, W, 3) at points (n, 2) of a plane: linear colours (n, 3), NaN outside the photograph.
+    """Sample a photograph (H, W, 3) at `points` (n, 2) of a plane: linear colours (n, 3), NaN outside the photograph.
 
-    `plane` (3, 3): homography that maps points to pixels. `linear`: see `sample_paper`.
+    `plane` (3, 3): homography from the plane to pixels. `linear`: see `sample_paper`.
     """
     at = cv2.perspectiveTransform(points[None], plane) - 0.5
     height, width = photograph.shape[:2]

@@ -38,12 +38,12 @@ STATIC, MAX_STATIC = 0.01, 0.9
 
 
 def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Write reduced grey images, and their features to the database. Existing ones are kept."""
+    """Write reduced grey images to `folder`, and their features to the database. Existing ones are kept."""
     list(progress(extract_features(pictures, folder), "features", len(pictures)))
 
 
 def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Picture]:
-    """The photographs as soon as the database has their features; see `find_features`."""
+    """Like `find_features`; yields each photograph when its features are in the database."""
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=cores())
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
     database, grey = folder / "database.db", folder / "grey"
@@ -73,17 +73,17 @@ def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Pict
 
 
 def batches(things: Sequence[Any], count: int) -> Iterator[Sequence[Any]]:
-    """The things, `count` at a time."""
+    """Split a sequence into parts of `count` items."""
     return (things[k : k + count] for k in range(0, len(things), count))
 
 
 def grey_file(picture: Picture) -> str:
-    """The file name of a photograph's grey image. It has no spaces, which separate names in COLMAP's lists of pairs."""
+    """File name of the photograph's grey image, without spaces, which separate names in COLMAP's lists of pairs."""
     return f"{quote(picture.name, safe='')}.png"
 
 
 def camera_ids(database: Path) -> dict[str, int]:
-    """The cameras of the images in COLMAP's database, by file; empty if there is no database."""
+    """Camera ids of the images in COLMAP's database, by file name; empty if there is no database."""
     if not database.is_file():
         return {}
     with pycolmap.Database.open(database) as opened:
@@ -100,7 +100,7 @@ class Features(NamedTuple):
 
 
 def read_features(database: Path) -> dict[str, Features]:
-    """The features of the images in COLMAP's database, by file."""
+    """Read the features of all images in COLMAP's database, by file name."""
     with pycolmap.Database.open(database) as opened:
         cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
         return {
@@ -113,10 +113,10 @@ def read_features(database: Path) -> dict[str, Features]:
 
 
 def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The most similar one of the `others` (m, 128) to each descriptor (n, 128): indices (n,) and ratios (n,).
+    """Find for each descriptor (n, 128) the nearest of the `others` (m, 128). Returns (indices (n,), ratios (n,)).
 
-    A ratio is the angle to that one by the angle to the second nearest one; infinite if they are too far apart for a
-    match. Products of integers are exact in float32.
+    Ratio: angle to the nearest divided by angle to the second nearest; infinite if the nearest is too far for a match.
+    Products of integers are exact in float32.
     """
     others = torch.cat([others.float(), torch.zeros(1, others.shape[1])])  # the second nearest one if there is only one
     buffer, found = torch.empty(BLOCK, len(others)), []  # new memory for each block would take longer than its product
@@ -130,9 +130,9 @@ def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tens
 
 
 def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Matches (k, 2) uint32 between descriptors (n, 128) and (m, 128): those that are nearest to each other.
+    """Find mutual nearest neighbours of descriptors (n, 128), (m, 128).
 
-    Also their ratios (k,), the larger one of both directions. They are less than `LOOSE`.
+    Returns (index pairs (k, 2) uint32, ratios (k,)). A ratio is the larger of both directions, and less than `LOOSE`.
     """
     there, ratio = nearest(first, second)
     rows = (ratio < LOOSE).nonzero()[:, 0]
@@ -144,7 +144,7 @@ def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.nda
 
 
 def match_pair(first: Features, second: Features) -> Any:
-    """The geometry of two images, found by COLMAP's library, with all matches that agree with it.
+    """Estimate the two-view geometry of two images by COLMAP, with all matches that agree with it.
 
     The ratio test finds the geometry. Among matches that agree with the geometry few are wrong even if their ratio is
     near 1 (two similar features on an object, say), so these are kept as well.
@@ -162,10 +162,9 @@ def match_pair(first: Features, second: Features) -> Any:
 
 
 def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """How far matches (k, 2) [px] are from the geometry of two images [px].
+    """Residuals [px] of matches (k, 2) [px] with respect to a two-view geometry: (k,).
 
-    If that is a plane, or one viewpoint: from where the homography maps the first point. Otherwise Sampson's distance
-    from the epipolar line.
+    For a homography: distance from the mapped first point. Otherwise: Sampson distance from the epipolar line.
     """
     kinds = pycolmap.TwoViewGeometryConfiguration
     if geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
@@ -175,10 +174,10 @@ def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarra
 
 
 def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]:
-    """The pairs of photographs that are matched. `descriptors` (n, 128) of each, sorted by name.
+    """Choose the pairs of photographs to match. `descriptors` (n, 128) of each, sorted by the photograph's name.
 
-    Of many photographs only those that are similar or neighbours. Photographs are similar if they show the same words
-    (Sivic and Zisserman, "Video Google", 2003). The words are descriptors that are drawn from all photographs.
+    Of many photographs, only similar ones and neighbours are paired. Similar photographs show the same visual words
+    (Sivic and Zisserman, "Video Google", 2003). The words are descriptors drawn from all photographs.
     """
     pairs = list(itertools.combinations(range(len(descriptors)), 2))
     if len(descriptors) <= ALL_PAIRS:
@@ -195,12 +194,12 @@ def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]
 
 
 def count_words(descriptors: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
-    """The number of descriptors (n, 128) that each of the words (m, 128) is the most similar one to: (m + 1,)."""
+    """Histogram (m + 1,) of descriptors (n, 128) by the nearest of m `words` (m, 128). The last bin is for no match."""
     return torch.bincount(nearest(descriptors, words)[0], minlength=len(words) + 1)
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Match the pairs that the database lacks. Raises InputError if the first batch is from one viewpoint."""
+    """Match the image pairs that the database lacks. Raises InputError if the first batch is from one viewpoint."""
     features = read_features(folder / "database.db")
     files = [grey_file(picture) for picture in pictures]
     pairs = [(files[a], files[b]) for a, b in pairs_to_match([features[file].descriptors for file in files])]
@@ -215,7 +214,7 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
 def match_pairs(
     pairs: Sequence[tuple[str, str]], features: Mapping[str, Features], folder: Path
 ) -> Iterator[tuple[str, str]]:
-    """The pairs of files as soon as the database has their geometry. Existing ones are kept."""
+    """Match pairs of files; yields each when its two-view geometry is in the database. Existing ones are kept."""
     with pycolmap.Database.open(folder / "database.db") as opened:
         for batch in batches(pairs, BATCH):
             both = [(features[a], features[b]) for a, b in batch]
@@ -226,9 +225,9 @@ def match_pairs(
 
 
 def match_again(files: Collection[str], folder: Path, progress: Progress) -> bool:
-    """Match these files again where pairs match: by guided matching, which finds more matches, and more wrong ones.
+    """Match the matched pairs of these files again, by guided matching. Returns whether there was such a pair.
 
-    Guided matching searches for matches along the epipolar lines alone. Returns whether there was such a pair.
+    Guided matching searches along the epipolar lines only. It finds more matches, and more wrong ones.
     """
     database, listed = folder / "database.db", folder / "pairs.txt"
     pairs = [(a.name, b.name) for a, b, first, _ in read_matches(database)
@@ -249,7 +248,7 @@ def match_again(files: Collection[str], folder: Path, progress: Progress) -> boo
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
-    """The share of pairs of grey files that match and are from one viewpoint, so that all features move alike."""
+    """Share of matched pairs of grey files that are from one viewpoint: a homography maps all features."""
     with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
     asked, static = set(map(frozenset, pairs)), 0
@@ -262,7 +261,10 @@ def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
 
 
 def read_matches(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
-    """Read COLMAP's database: the two images of each matched pair, and verified matches (n, 2) [px] in each of them."""
+    """Read COLMAP's database.
+
+    Yields (image, image, points (n, 2) [px] in the first, in the second) for each matched pair.
+    """
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
         keypoints = {k: opened.read_keypoints(k)[:, :2] for k in images}

@@ -36,7 +36,7 @@ WIDE = 2.0  #: half size of the table's texture from whole photographs [half siz
 
 
 class SegmentedObject(NamedTuple):
-    """The object as found: its masks, its place, and the table."""
+    """The segmented object: masks, position and size, and the table."""
 
     masks: dict[str, np.ndarray]  #: (H, W) uint8 of `OBJECT`, `UNKNOWN` and 0, by the photograph's name
     center: np.ndarray  #: (3,)
@@ -45,7 +45,7 @@ class SegmentedObject(NamedTuple):
 
 
 class SegmentationInput(NamedTuple):
-    """What is known before the object is segmented, from the user or from the sheet."""
+    """What the user or the sheet says about the object before it is segmented."""
 
     plane: Plane | None = None  #: the table
     box: tuple[float, ...] | None = None  #: around the object: x low, x high, y low, y high, z low, z high
@@ -53,14 +53,17 @@ class SegmentationInput(NamedTuple):
     sheet: bool = False  #: is `plane` that of the printed sheet?
 
     def digest(self) -> str:
-        """Text that changes with the source of masks: for a folder a hash of file names, sizes and times."""
+        """Hash of the mask source, to notice changes. For a folder: of file names, sizes and times."""
         if not isinstance(self.masks, Path):
             return self.masks
         files = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(self.masks.iterdir()) if f.is_file()]
         return hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
 
     def allows(self, points: np.ndarray, camera_distance: float, flatness: float = 2 * FLATNESS) -> np.ndarray:
-        """Which points (N, 3) may be the object: in the box, and `flatness` · `camera_distance` above the table."""
+        """Test which points (N, 3) may belong to the object: (N,) bool.
+
+        They must be in the box, and at least `flatness` · `camera_distance` above the table.
+        """
         allowed = np.ones(len(points), bool)
         if self.plane:
             allowed &= self.plane.height(points) > flatness * camera_distance
@@ -73,9 +76,9 @@ class SegmentationInput(NamedTuple):
 def find_object(
     pictures: Sequence[Picture], sparse: SparseModel, known: SegmentationInput, folder: Path, progress: Progress
 ) -> SegmentedObject:
-    """Find the object and its masks. Existing masks in `folder` are used: the user may have edited or removed some.
+    """Segment the object in all photographs. Masks that exist in `folder` are reused: the user may have edited them.
 
-    Raises InputError if the existing masks were found with other cameras or another `known`, or if no object is found.
+    Raises InputError if the existing masks were made with other cameras or another `known`, or if no object is found.
     """
     folder.mkdir(exist_ok=True)
     record = folder / "object.json"
@@ -132,7 +135,10 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
 def given_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """Read the user's masks and find the object by them. Raises InputError if masks are too few or disagree."""
+    """Read the user's masks and find the object by them. Returns (object, masks by the photograph's name).
+
+    Raises InputError if masks are too few or disagree.
+    """
     masks = {}
     for picture in progress(pictures, "masks"):
         mask = picture.mask(known.masks)
@@ -163,7 +169,7 @@ def require_half(count: int, pictures: Sequence[Picture], source: str | Path) ->
 
 
 def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
-    """Mask the box of `SegmentationInput` in a photograph: (H, W) uint8; all 1 if it reaches behind the camera."""
+    """Mask (H, W) uint8 of the box that the object is in; all 1 if the box reaches behind the camera."""
     pixels, depth = camera.project(np.array(list(itertools.product(*np.reshape(box, (3, 2))))))
     if depth.min() <= 0:  # a corner is behind the camera
         return np.ones(camera.size[::-1], np.uint8)
@@ -174,7 +180,10 @@ def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
 def find_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """Find the object and its clear masks. Raises InputError if no object is found or too few masks agree."""
+    """Segment the object. Returns (object, masks by the photograph's name), without unclear masks.
+
+    Raises InputError if no object is found or too few masks agree.
+    """
     folder = pictures[0].path.parent
     found = locate_object(grid, sparse.points, known, progress)
     silhouettes = [found.silhouette(view) for view in grid.views] if found else []
@@ -208,7 +217,10 @@ def refine_object(
     views: Views, found: VoxelObject, whole: VoxelGrid, known: SegmentationInput, settings: RefinementSettings,
     progress: Progress,
 ) -> Segmentation | None:  # fmt: skip
-    """Refine the object `found` in new views around it. `whole`: the grid with the views of whole photographs."""
+    """Refine the masks of the object `found` in enlarged views around it. None if the masks disagree.
+
+    `whole`: the grid with views of whole photographs.
+    """
     grid = VoxelGrid.around(views, found)
     grid.allowed = known.allows(grid.points, grid.camera_distance, FLATNESS / 2)
     silhouettes, backgrounds = [found.silhouette(view) for view in views], automatic_masks.empty_masks(views)

@@ -18,7 +18,7 @@ MARGIN = 0.3  #: around the object in a window [size of the object]
 
 
 class ReducedView(NamedTuple):
-    """A photograph or a window of it, reduced and undistorted."""
+    """A photograph, or a window of one, that is reduced and undistorted."""
 
     name: str
     rgb: np.ndarray  #: (H, W, 3) uint8 sRGB
@@ -31,7 +31,10 @@ class ReducedView(NamedTuple):
         return srgb_to_linear(np.arange(256, dtype=np.float32) / 255)[self.rgb]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points (N, 3): rows (N,) and columns (N,) of pixels, and whether the view shows each (N,)."""
+        """Project points (N, 3).
+
+        Returns (pixel rows (N,), pixel columns (N,), whether the view shows each point (N,)).
+        """
         projection, (width, height) = self.camera.projection.astype(np.float32), self.camera.size
         x, y, depth = projection[:, :3] @ points.astype(np.float32).T + projection[:, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -20,7 +20,10 @@ SETTINGS = Config.preset("fast", iterations=ITERATIONS, levels=(4,), widths=(128
 
 
 def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> tuple[np.ndarray, float] | None:
-    """Find a sphere around most points (N, 3) near `center`: centre (3,) and radius; None if too few are near."""
+    """Find a sphere around most points (N, 3) near `center`.
+
+    Returns (centre (3,), radius); None if too few are near.
+    """
     near = points[np.linalg.norm(points - center, axis=1) < half_size]
     if len(near) < MIN_POINTS:
         return None
@@ -30,7 +33,10 @@ def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> 
 
 
 def shading_silhouettes(views: Views, center: np.ndarray, radius: float, progress: Progress) -> list[np.ndarray]:
-    """Fit a surface from a sphere, and mask it in each view: (H, W) uint8. Raises InputError if the fit diverges."""
+    """Run a short fit that starts from a sphere. Returns the object's mask in each view, (H, W) uint8.
+
+    Raises InputError if the fit diverges.
+    """
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     level = float(np.median([view.linear[view.valid].mean() for view in views]))
     intensity = np.full(3, np.pi * level / ASSUMED_ALBEDO * distance**2)

@@ -43,7 +43,7 @@ BLURRED = 0.25  #: a photograph with less detail is blurred [detail of those wit
 
 @dataclass
 class SparseModel:
-    """Cameras of the photographs by name, and sparse points of the scene [any unit]."""
+    """Cameras by the photograph's name, and a sparse point cloud of the scene [any unit]."""
 
     cameras: dict[str, tuple[Lens, np.ndarray]]  #: lens and camera-to-world pose (4, 4), OpenCV's axes
     points: np.ndarray  #: (N, 3)
@@ -52,7 +52,7 @@ class SparseModel:
     source: str = ""  #: where the cameras are from; empty: structure from motion
 
     def digest(self) -> str:
-        """A hash of the cameras, by which a change is noticed."""
+        """Hash of the cameras, to notice changes."""
         cameras = [f"{name} {lens.model} {lens.params} {pose.round(6).tolist()}"
                    for name, (lens, pose) in sorted(self.cameras.items())]  # fmt: skip
         return hashlib.blake2b("\n".join(cameras).encode(), digest_size=8).hexdigest()
@@ -62,7 +62,7 @@ class SparseModel:
         return float(np.median([np.linalg.norm(pose[:3, 3] - point) for _, pose in self.cameras.values()]))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "SparseModel":
-        """Move cameras and points to another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        """Transform cameras and points to another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
         cameras = {n: (lens, moved_pose(pose, scale, rotation, shift)) for n, (lens, pose) in self.cameras.items()}
         return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
 
@@ -70,7 +70,10 @@ class SparseModel:
 def structure_from_motion(
     pictures: Sequence[Picture], detections: Detections, folder: Path, progress: Progress
 ) -> SparseModel:
-    """Find cameras by features of photographs, one lens per size. Raises InputError if fewer than half get one."""
+    """Estimate cameras from image features, one lens per image size.
+
+    Raises InputError if under half of the photographs succeed.
+    """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     sparse = folder / "sparse"
     if sparse.is_dir():
@@ -99,7 +102,7 @@ def structure_from_motion(
 
 
 def placed_files(model: Any) -> set[str]:
-    """The files that have a pose in a model; none if there is no model."""
+    """Return the file names of images that have a pose in a model; empty if `model` is None."""
     return {model.images[k].name for k in model.reg_image_ids()} if model else set()
 
 
@@ -135,7 +138,7 @@ def deregister(model: Any, images: Iterable[int]) -> None:
 
 
 def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
-    """Make models by global mapping, by number. `paths`: database, images, output."""
+    """Run global mapping. Returns models by number. `paths`: database, images, output."""
     options = pycolmap.GlobalPipelineOptions(random_seed=0)
     mapper = options.mapper
     for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
@@ -145,7 +148,7 @@ def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
 
 
 def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> dict[int, Any]:
-    """Make models of `count` photographs by incremental mapping, by number. `paths`: database, images, output."""
+    """Run incremental mapping of `count` photographs. Returns models by number. `paths`: database, images, output."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     options.mapper.random_seed = options.triangulation.random_seed = 0
     bar = iter(progress(range(count), "cameras", count))
@@ -158,7 +161,7 @@ def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> 
 
 
 class ImagePair(NamedTuple):
-    """Two images of a model, the number of their matches, and how many matches their poses explain."""
+    """Two images of a model, the number of their matches, and how many of these agree with the poses."""
 
     first: int
     second: int
@@ -167,7 +170,7 @@ class ImagePair(NamedTuple):
 
 
 def check_pairs(model: Any, database: Path) -> list[ImagePair]:
-    """Count matches and explained matches of all pairs of images that have a pose in the model."""
+    """For each pair of images with poses, count all matches and the matches that agree with the poses."""
     images = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
     pairs = []
     for one, other, first, second in read_matches(database):
@@ -194,7 +197,7 @@ def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> li
 
 
 def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Sampson distances (n,) [px] of matches (n, 2) [px] in two images, by the epipolar geometry of their poses."""
+    """Sampson distances (n,) [px] of matches (n, 2) [px] between images `a` and `b`, from the poses in a model."""
     cameras = model.cameras[a.camera_id], model.cameras[b.camera_id]
     rays = (camera.cam_from_img(pixels) for camera, pixels in zip(cameras, (first, second)))
     essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
@@ -202,7 +205,7 @@ def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.n
 
 
 def to_sparse_model(model: Any, pictures: Sequence[Picture], folder: Path) -> SparseModel:
-    """Convert a model: cameras and errors [px] are then those of the photographs at full size."""
+    """Convert a COLMAP model. Cameras and reprojection errors [px] then refer to the photographs at full size."""
     cameras, scales = model_cameras(model, pictures), [scale for _, _, scale in registered(model, pictures)]
     error = float(model.compute_mean_reprojection_error() * np.mean(scales))
     return SparseModel(cameras, model_points(model), error, failure_reasons(pictures, cameras, folder))
@@ -214,7 +217,7 @@ def model_points(model: Any) -> np.ndarray:
 
 
 def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: Path) -> dict[str, str]:
-    """Say why photographs that are not `placed` have no camera, by their names."""
+    """Explain why photographs that are not `placed` have no camera: reason by the photograph's name."""
     failed, reasons = [picture for picture in pictures if picture.name not in placed], {}
     detail = {p.name: sharpness(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
     for name, file in ((picture.name, grey_file(picture)) for picture in failed):
@@ -236,7 +239,7 @@ def sharpness(file: Path) -> float:
 
 
 def advice(pictures: Sequence[Picture], folder: Path, count: int) -> str:
-    """Say why only `count` photographs have a camera, and what to do."""
+    """Explain why only `count` photographs have a camera, and what to do."""
     with pycolmap.Database.open(folder / "database.db") as opened:
         features = np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()])
         matched = sum(len(geometry.inlier_matches) >= MIN_MATCHES for geometry in opened.read_two_view_geometries()[1])

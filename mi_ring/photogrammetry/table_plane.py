@@ -37,7 +37,7 @@ NEAR, INSIDE, CONFUSED, SPECK = 0.3, 0.1, 0.03, 0.015
 
 
 class Plane(NamedTuple):
-    """The table's plane: points x with normal · x = offset. The normal, of length 1, points to the cameras' side."""
+    """The table's plane, normal · x = offset. The unit normal points to the side of the cameras."""
 
     normal: np.ndarray  #: (3,)
     offset: float
@@ -52,7 +52,10 @@ class Plane(NamedTuple):
 
 
 def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half_size: float) -> Plane | None:
-    """Find the plane with most points (N, 3) around `center`, by RANSAC, below all cameras (K, 3); None without one."""
+    """Find the plane with most of the `points` (N, 3) around `center`, by RANSAC. None if there is none.
+
+    All `cameras`, positions (K, 3), must be above it.
+    """
     near = points[np.linalg.norm(points - center, axis=1) < 2 * half_size]
     if len(near) < 50:
         return None
@@ -82,7 +85,7 @@ def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half
 
 
 class TexelGrid:
-    """A square of texels² in a plane, around the point below `center` (3,), with sides of 4 `half_size`."""
+    """A square of texels × texels in a plane, around the point below `center` (3,), with sides of 4 · `half_size`."""
 
     def __init__(self, plane: Plane, center: np.ndarray, half_size: float, texels: int = TEXELS) -> None:
         self.texels, self.normal, across = texels, plane.normal, plane.axes()[:2]
@@ -95,7 +98,10 @@ class TexelGrid:
 
     @property
     def to_world(self) -> np.ndarray:
-        """The matrix (4, 4) from Mitsuba's rectangle (x, y from -1 to 1, normal z) to the world. First row: y = -1."""
+        """Transform (4, 4) from Mitsuba's rectangle (x, y from -1 to 1, normal z) to the world.
+
+        Texel row 0 is at y = -1.
+        """
         middle = self.from_texel @ np.array([(self.texels - 1) / 2, (self.texels - 1) / 2, 1])
         across = self.from_texel[:, :2] * self.texels / 2
         normal = np.cross(across[:3, 0], across[:3, 1]) / np.linalg.norm(across[:, 0])
@@ -119,10 +125,11 @@ class TexelGrid:
 def estimate_albedo(
     views: Views, lights: Sequence[Light], hidden: Masks, grid: TexelGrid, flash: FlashCalibration
 ) -> np.ndarray | None:
-    """Estimate the table's diffuse albedo (texels, texels, 3), the median over views; None if no view shows the table.
+    """Estimate the table's diffuse albedo (texels, texels, 3): the median over views. None if no view shows the table.
 
-    `lights`: one per view. `flash`: cone, room's light and response. `hidden` (H, W): above 0 where the table may be
-    hidden. Texels that no view shows get the median of the others. Interreflection is ignored.
+    `lights`: one per view. `hidden` (H, W) of each view: above 0 where something may hide the table. `flash`: gives
+    cone, room light and camera response. Texels that no view shows get the median of the others. Interreflection is
+    ignored.
     """
     found = np.full((len(views), grid.texels**2, 3), np.nan, np.float32)
     for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
@@ -166,7 +173,10 @@ class TableAppearance:
         self.texture = np.concatenate([nan_median(self.observe_all(part)) for part in progress(parts, "table")])
 
     def observe(self, number: int, texels: np.ndarray) -> np.ndarray:
-        """Log radiance (N, 3) of texels (N,) in view `number`, without its illumination; NaN where not shown."""
+        """Log radiance (N, 3) of the texels with indices `texels` (N,) in view `number`, without the view's illumination.
+
+        NaN where the view does not show them.
+        """
         row, column, inside = self.views[number].project(self.grid.points[texels])
         if self.hidden:
             inside &= self.hidden[number][row, column] == 0
@@ -178,7 +188,7 @@ class TableAppearance:
         return np.stack(list(in_threads(partial(self.observe, texels=texels), range(len(self.views)))))
 
     def foreign_masks(self) -> list[np.ndarray]:
-        """Mask where each view differs from the table, because something stands there: (H, W) uint8 each."""
+        """For each view, mask (H, W) uint8 of pixels that differ from the table, because something stands there."""
         result, everywhere = [], np.arange(len(self.texture))
         for number, view in enumerate(self.progress(self.views, "beside the table")):
             rest = np.abs(self.observe(number, everywhere) - self.texture).max(1)
@@ -189,7 +199,7 @@ class TableAppearance:
         return result
 
     def pattern_masks(self) -> list[np.ndarray]:
-        """Mask where each view certainly shows the table, by the table's pattern: (H, W) uint8 each."""
+        """For each view, mask (H, W) uint8 of pixels that certainly show the table, because they match its pattern."""
         known = self.texture.mean(1)
         return [
             match_pattern(LOG_RADIANCE[view.rgb].mean(-1), self.grid.render(view, known))
@@ -205,10 +215,10 @@ class TableAppearance:
 def bare_table(
     views: Views, silhouettes: Masks, tables: Sequence[TableAppearance], progress: Progress
 ) -> list[np.ndarray] | None:
-    """Mask where each view shows the table alone, (H, W) uint8 each; None if the object looks like the table.
+    """For each view, mask (H, W) uint8 of pixels that show only the table. None if the object looks like the table.
 
-    `tables`: appearances; each pixel is compared with the first that shows it. `silhouettes` (H, W): rough outlines of
-    the object in each view. Darker pixels count as shadows on the table, unless the object then looks like the table.
+    `tables`: appearances; each pixel is compared with the first that covers it. `silhouettes` (H, W): rough masks of
+    the object. Darker pixels count as shadows on the table, unless the object then looks like the table.
     """
     differences = []
     for view in progress(views, "bare table"):
@@ -252,7 +262,10 @@ def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 
 def nan_median(stack: np.ndarray) -> np.ndarray:
-    """The lower median over the first axis without NaN; NaN if all are NaN. Much faster than `np.nanmedian`."""
+    """Median over the first axis, ignoring NaN; the lower one of two; NaN if all are NaN.
+
+    Much faster than `np.nanmedian`.
+    """
     middle = np.maximum(np.isfinite(stack).sum(0) - 1, 0) // 2
     return np.take_along_axis(np.sort(stack, 0), middle[None], 0)[0]
 
@@ -271,7 +284,7 @@ def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def match_pattern(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Mark where log radiance `seen` (H, W) correlates with the `table`'s (H, W; NaN if unknown): (H, W) uint8."""
+    """Mask (H, W) uint8 of pixels where log radiance `seen` (H, W) correlates with that of the `table` (H, W; may be NaN)."""
     known = np.isfinite(table)
     mean = partial(cv2.blur, ksize=(WINDOW, WINDOW))
     a, b = seen.astype(np.float32), np.where(known, table, 0).astype(np.float32)

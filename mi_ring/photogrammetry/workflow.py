@@ -36,7 +36,7 @@ FORMAT = 3  #: version of the saved results; increase it when they change
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
-    """Raise InputError if the results in `folder` are of other photographs or of another format."""
+    """Raise InputError if `folder` has results of other photographs or in another format."""
     with writing(f"{folder.parent}: DIR"):
         folder.mkdir(parents=True, exist_ok=True)
     record, first = folder / "photographs.json", folder / "sheet.json"  # without the latter there are no results
@@ -54,10 +54,10 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
 def make_upright(
     sparse: SparseModel, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
 ) -> tuple[SparseModel, Plane | None, bool]:
-    """Move model and table to a frame with origin `center` (3,), z up, and the cameras at distance 1.
+    """Transform model and table to a frame with origin `center` (3,), z up, and cameras at about distance 1.
 
-    Up is the table's normal, otherwise the mean of `ups` (3,), each in the axes of its camera. Returns the model, the
-    table, and whether up is known: it is not if the `ups` cancel out.
+    Returns (model, table, whether up is known). Up is the table's normal, else the mean of `ups` (3,), each in the axes
+    of its camera; it is unknown if these cancel out.
     """
     scale = 1 / sparse.distance(center)
     up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in sparse.cameras.items()], 0)
@@ -68,7 +68,7 @@ def make_upright(
 
 
 class SheetObservations(NamedTuple):
-    """The printed sheet in the photographs, by the photograph's name."""
+    """What the photographs show of the printed sheet, by the photograph's name."""
 
     detections: dict[str, SheetDetection]
     papers: dict[str, PaperSamples]
@@ -109,7 +109,7 @@ def find_sheet(
 
 
 def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
-    """Read cameras of another tool beside the photographs; None if there are none.
+    """Read cameras that another tool has left beside the photographs. None if there are none.
 
     Raises InputError if the cameras are invalid, or if most photographs have none.
     """
@@ -223,10 +223,10 @@ def posed_pictures(
     pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
     flash: FlashCalibration | None,
 ) -> list[PosedPicture]:  # fmt: skip
-    """Join the photographs that have a camera with their calibration.
+    """Combine each photograph that has a camera with its camera, light and masks.
 
-    Without a calibrated `flash`, `offset` (3,) is its position relative to the lens [scene units], and its intensity is
-    that of `ASSUMED_ALBEDO`.
+    Without a calibrated `flash`, the flash is at `offset` (3,) relative to the lens [scene units], and its intensity
+    follows from `ASSUMED_ALBEDO`.
     """
     offsets = turn_with_cameras(pictures, flash.offset if flash else offset)
     known = flash.intensities if flash else {}
