@@ -6,7 +6,7 @@ from mi_ring.system.files import read_json
 
 
 def ambiguity(light: str) -> str:
-    """Return the warning about what a fit cannot know under this kind of light; empty if the capture gives the light."""
+    """Return the warning about what this kind of light leaves unknown; empty if the capture gives the light."""
     if light == "capture":
         return ""
     text = ("The light was unknown: its brightness and colour cannot be separated from those of the object. "

@@ -33,7 +33,7 @@ class Atlas(NamedTuple):
 
 
 def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
-    """Unwrap the surface for square textures of `resolution` × `resolution` texels, by xatlas (Young 2018, after Thekla).
+    """Unwrap the surface for square textures with sides of `resolution` texels, by xatlas (Young 2018, after Thekla).
 
     `subdivisions`: level of the mesh. `time`: of the flow, in [0, 1].
     """
@@ -74,7 +74,10 @@ def subdivide(
 def assemble(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
 ) -> Atlas:
-    """Make an atlas from domain points `s`, texture coordinates `uv` and `faces`: compute vertices, normals and tangents."""
+    """Make an atlas: compute its vertices, normals and tangents, after `subdivisions` of each triangle.
+
+    `s` (V, 3): domain points. `uv` (V, 2): texture coordinates. `faces` (F, 3). `time`: of the flow.
+    """
     points, normals, uncut = seamless_surface(ring, s, faces, time)
     # The derivative of the position with respect to u: constant on a triangle, at vertices the mean weighted by area.
     (e1, e2), (d1, d2) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (points, uv))

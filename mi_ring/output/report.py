@@ -175,7 +175,7 @@ def middle(values: Sequence[float] | Sequence[tuple[float, float]]) -> tuple[np.
 
 
 def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
-    """Format the `most` entries of lowest rank among tuples (rank, name, number) in one line; empty if there are none."""
+    """List the lowest of tuples (rank, name, number) in one line, at most `most`; empty if there are none."""
     ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
     return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
 

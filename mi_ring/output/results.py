@@ -173,7 +173,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
     """Write the masks of photographs `index` as PNG. Each has its photograph's name with .png added.
 
-    Returns file names by index, relative to a scene file in `folder`.
+    Returns file names by index, relative to a scene file beside `folder`.
     """
     names = {}
     for k in index:

@@ -284,7 +284,10 @@ def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def match_pattern(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Mask (H, W) uint8 of pixels where log radiance `seen` (H, W) correlates with the `table`'s (H, W; NaN: unknown)."""
+    """Mask (H, W) uint8 of pixels where log radiance `seen` (H, W) correlates with that of the `table`.
+
+    `table` (H, W): log radiance without the object; NaN where it is unknown.
+    """
     known = np.isfinite(table)
     mean = partial(cv2.blur, ksize=(WINDOW, WINDOW))
     a, b = seen.astype(np.float32), np.where(known, table, 0).astype(np.float32)

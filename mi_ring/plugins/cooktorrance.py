@@ -109,7 +109,7 @@ class CookTorrance(mi.BSDF):
         return ((si.wi.z > 0) | (dr.dot(si.wi, n) > 0)) & (wo.z > 0)
 
     def microfacets(self, r):
-        """Make Mitsuba's microfacet distribution for roughness `r`: its D is D / π of the paper; it samples visible normals."""
+        """Make Mitsuba's microfacet distribution for roughness `r`: D / π and G of equation 1, and visible normals."""
         return mi.MicrofacetDistribution(DISTRIBUTIONS[self.distribution], r, True)
 
     def with_fresnel(self, specular, cosine):
