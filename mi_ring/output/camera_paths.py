@@ -189,7 +189,7 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
 
 
 def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
-    """Return the object under the scene's lights; with --envmap under that environment, without the scene's table."""
+    """Return the object in the scene; with --envmap under that environment and the scene's lamps, without a table."""
     if not config.envmap:
         return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
     to_world = np.eye(4)

@@ -127,9 +127,9 @@ class Edges:
     def shadow_casters(self, light, views, seed, seen, before=0):
         """Sample edges that cast the edge of a shadow (casters), and those that are one themselves (terminators).
 
-        Returns both, for the eye `light`. `seen`: `fronts` of the cameras. Casters are the outlines for the light.
-        Terminators are casters of which the camera sees both triangles. The one that does not face the light is black,
-        even where interpolated normals face the light.
+        Returns (casters, terminators) for the eye `light`. `seen`: `fronts` of the cameras. Casters are the outlines
+        for the light. Terminators are casters of which the camera sees both triangles. The triangle that does not face
+        the light is black, even where interpolated normals face the light.
         """
         casters = [curve for shape in self.others for curve in outline_of(shape, light, views, seed, before)]
         terminators = []

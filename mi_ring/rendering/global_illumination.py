@@ -70,7 +70,10 @@ class GlobalIllumination:
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
 
     def occlusion(self, room: Tensor) -> Tensor:
-        """Radiance (N, H, W, 3) to add to pictures with unoccluded room light (BASIS, 3): shadows and interreflection."""
+        """Radiance (N, H, W, 3) that pictures with unoccluded room light lack: its shadows and interreflection.
+
+        `room` (BASIS, 3): spherical harmonics. The shadows are negative.
+        """
         difference = self.transfer - self.unoccluded
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))
 

@@ -53,7 +53,10 @@ class Lights:
         return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength_of(emitter))))
 
     def eye(self, k):
-        """Return light `k`, one number per lane, as an eye: a position, or the direction toward a distant light; see `Edges`."""
+        """Return light `k`, one number per lane, as an eye; see `Edges`.
+
+        It is a position, or the direction toward a distant light.
+        """
         return dr.gather(mi.Vector3f, self.places, k), dr.gather(mi.Bool, self.finite, k)
 
     def sample(self, k, si):

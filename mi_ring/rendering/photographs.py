@@ -172,7 +172,7 @@ class Photographs:
         return math.prod(self.shape)
 
     def first_lane(self, spp: int, first: int = 0):
-        """Index of the first lane of the selected photographs, or of their pixel `first`, with `spp` lanes per pixel."""
+        """Index of the first lane of the selection, or of pixel `first` in it, with `spp` lanes per pixel."""
         return dr.opaque(mi.UInt32, (self.before * self.size[0] * self.size[1] + first) * spp % 2**32)
 
     def chunks(self, spp: int) -> Iterator[tuple[int, int]]:
