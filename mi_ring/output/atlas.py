@@ -74,9 +74,10 @@ def subdivide(
 def assemble(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
 ) -> Atlas:
-    """Make an atlas: compute its vertices, normals and tangents, after `subdivisions` of each triangle.
+    """Make an atlas: compute normals, tangents and positions of the vertices.
 
-    `s` (V, 3): domain points. `uv` (V, 2): texture coordinates. `faces` (F, 3). `time`: of the flow.
+    `s` (V, 3): domain points. `uv` (V, 2): texture coordinates. `faces` (F, 3). `subdivisions`: level of this mesh.
+    `time`: of the flow.
     """
     points, normals, uncut = seamless_surface(ring, s, faces, time)
     # The derivative of the position with respect to u: constant on a triangle, at vertices the mean weighted by area.
