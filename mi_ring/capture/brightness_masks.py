@@ -67,7 +67,7 @@ def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_brightness(capture: Capture, k: int) -> np.ndarray:
-    """Return `brightness` of photograph `k`, reduced by block means to a shorter side of 256 pixels or slightly more."""
+    """Return `brightness` of photograph `k`, reduced by block means to a shorter side of at least 256 pixels."""
     image = torch.from_numpy(brightness(capture, k))[..., None]
     return box_filter(image, max(1, min(image.shape[:2]) // 256))[..., 0].numpy()
 

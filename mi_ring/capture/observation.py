@@ -25,7 +25,7 @@ class Observation(NamedTuple):
     valid: Tensor | None  #: (n, H, W) bool; invalid pixels are black and clipped. None: all are valid
 
     def surely(self, coverage: Tensor) -> Tensor:
-        """Find pixels (n, H, W) bool that show only the object, by `coverage` (n, H, W) and the mask, if there is one."""
+        """Find pixels (n, H, W) bool that show only the object, by `coverage` (n, H, W) and by the masks, if any."""
         mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
         return torch.minimum(mask, coverage) > 0.99
 

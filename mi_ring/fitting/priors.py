@@ -59,7 +59,7 @@ def number_of_bases(values: Tensor) -> Tensor:
 def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
     """Arrange the material parameters of V points as a matrix (V, C) of numbers near 1.
 
-    Parameters without upper bound are divided by their `scale`; others become a share of their range.
+    Parameters without upper bound are divided by BRDF-Net's `scale`; others become a share of their range.
     """
     columns = []
     for p in brdf_net.bsdf_parameters:

@@ -48,7 +48,10 @@ def compare_photographs(
 
 
 def comparable(capture: Capture, seen: Observation) -> np.ndarray:
-    """Find the pixels (H, W) bool to compare in the first photograph: valid and, in a lit room, inside the mask if any."""
+    """Find the pixels (H, W) bool of the first photograph to compare.
+
+    They are valid and, in a lit room, inside the mask if there is one.
+    """
     valid = np.ones(seen.mask.shape[1:], bool) if seen.valid is None else seen.valid[0].numpy()
     return valid & (seen.mask[0].numpy() > 0.99) if seen.masked[0] and capture.lit_room else valid
 

@@ -74,7 +74,7 @@ OTHERS = {
 
 
 def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
-    """Share of the pixels of all masks that the visual hull covers; 0 if the hull is empty."""
+    """Share of mask pixels that all masks confirm: their rays hit the visual hull. 0 if the hull is empty."""
     try:
         return float((Hull(silhouettes, "").shortfall(samples=48) < 1).mean())
     except InputError:
@@ -102,10 +102,7 @@ def mistake_in_masks(silhouettes: Sequence[Silhouette]) -> dict[str, Sequence[Si
 
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
-    """Find a common mistake in the cameras that explains why masks disagree.
-
-    Returns its description and remedy, or None.
-    """
+    """Find a common mistake in masks or cameras that explains why masks disagree. Returns its description, or None."""
     some = subsample(silhouettes, 32, 96)
     limit = max(CONFORMS, share_agreed(some) + 0.05)
     masks = {name: share_agreed(subsample(guess, 32, 96)) for name, guess in mistake_in_masks(silhouettes).items()}

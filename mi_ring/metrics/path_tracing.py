@@ -49,7 +49,7 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
 
 
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """Return the scene with exactly one `flash` and no `room`, so that Mitsuba's own integrators see the photographs' light.
+    """Return the scene with exactly one `flash` and no `room`, for Mitsuba's own integrators.
 
     A `shapenet` has a `flash` already. Raises SceneError if there are several.
     """

@@ -41,7 +41,7 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 
 def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
-    """Estimate the transform (4, 4) that aligns `mesh` with the nearby mesh `onto`: rigid, or with scale if `similarity`.
+    """Estimate the transform (4, 4), rigid or a `similarity`, that aligns `mesh` with the nearby mesh `onto`.
 
     Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because parts of `onto` may be missing.
     """

@@ -6,7 +6,7 @@ from mi_ring.system.files import read_json
 
 
 def ambiguity(light: str) -> str:
-    """The warning for a light, named as in a fit's summary; empty if the capture gives the light."""
+    """Return the warning about what this kind of light leaves unknown; empty if the capture gives the light."""
     if light == "capture":
         return ""
     text = ("The light was unknown: its brightness and colour cannot be separated from those of the object. "
@@ -17,7 +17,7 @@ def ambiguity(light: str) -> str:
 
 
 def ambiguity_of(run: Path) -> str:
-    """The warning for a results folder, or for a ring.pt in one."""
+    """Return the warning of `ambiguity` for `run`, a results folder or the ring.pt in one."""
     record = read_json((run if run.is_dir() else run.parent) / "calibration.json")
     light = record.get("light") if isinstance(record, dict) else None
     return ambiguity(light) if isinstance(light, str) else ""

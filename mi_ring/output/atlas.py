@@ -20,7 +20,7 @@ CHUNK = 2**17  #: texels that the networks evaluate at once
 
 
 class Atlas(NamedTuple):
-    """A mesh with V vertices, which are split along the seams."""
+    """A mesh with texture coordinates. Its V vertices are duplicated along seams."""
 
     s: np.ndarray  # (V, 3) domain points
     uv: np.ndarray  # (V, 2) in [0, 1], the first texel at (0, 0)
@@ -33,7 +33,10 @@ class Atlas(NamedTuple):
 
 
 def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
-    """Unwrap a surface for square textures of `resolution` texels a side, by xatlas (Young 2018, after Thekla)."""
+    """Unwrap the surface for square textures with sides of `resolution` texels, by xatlas (Young 2018, after Thekla).
+
+    `subdivisions`: level of the mesh. `time`: of the flow, in [0, 1].
+    """
     points, faces = ring.domain.sample(min(subdivisions, MAX_CUT_LEVEL))
     xatlas = need("xatlas", "textures")
     options = xatlas.PackOptions()
@@ -49,7 +52,7 @@ def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: 
 
 
 def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
-    """Move domain points (V, 3) to the surface at a `time` of the flow: (V, 3) in the normalised frame."""
+    """Map domain points (V, 3) to the surface at `time` of the flow: points (V, 3) in the normalised frame."""
     with torch.no_grad():
         return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
@@ -57,7 +60,10 @@ def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndar
 def subdivide(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Subdivide every triangle into four. New vertices are on the domain; `uv` and `more` (V, n) are interpolated."""
+    """Subdivide every triangle into four. Returns `s`, `uv`, `faces` and `more` of the new mesh.
+
+    New vertices `s` are on the domain; `uv` (V, 2) and `more` (V, n) are interpolated.
+    """
     attributes = dict(enumerate((uv, *more)))
     finer, faces, attributes = trimesh.remesh.subdivide(s.astype(float), faces, vertex_attributes=attributes)
     finer[len(s) :] = ring.domain.project(finer[len(s) :])
@@ -68,7 +74,11 @@ def subdivide(
 def assemble(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
 ) -> Atlas:
-    """Make an atlas with vertices, normals and tangents."""
+    """Make an atlas: compute normals, tangents and positions of the vertices.
+
+    `s` (V, 3): domain points. `uv` (V, 2): texture coordinates. `faces` (F, 3). `subdivisions`: level of this mesh.
+    `time`: of the flow.
+    """
     points, normals, uncut = seamless_surface(ring, s, faces, time)
     # The derivative of the position with respect to u: constant on a triangle, at vertices the mean weighted by area.
     (e1, e2), (d1, d2) = ([x[faces[:, k]] - x[faces[:, 0]] for k in (1, 2)] for x in (points, uv))
@@ -90,9 +100,9 @@ def assemble(
 def seamless_surface(
     ring: FittedObject, s: np.ndarray, faces: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the surface at points `s` (V, 3) of the domain with triangles `faces`, at `time` of the flow.
+    """Evaluate the surface at domain points `s` (V, 3) with triangles `faces`, at `time` of the flow.
 
-    Returns points (V, 3) in the normalised frame, normals (V, 3) that are smooth across seams, and `Atlas.uncut`.
+    Returns (points (V, 3) in the normalised frame, normals (V, 3) that are smooth across seams, `Atlas.uncut`).
     """
     unique, uncut = np.unique(s, axis=0, return_inverse=True)
     uncut = uncut.ravel()
@@ -103,7 +113,7 @@ def seamless_surface(
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels of a square texture. A texel between charts is a copy of the nearest texel in a chart."""
+    """The texels of a square texture. Texels outside all charts copy the nearest texel inside one."""
 
     s: np.ndarray  # (N, 3) domain points of the N texels in charts
     normals: np.ndarray  # (N, 3) unit normals in the tangent frame of the atlas: along t, the bitangent, n
@@ -111,7 +121,10 @@ class Texels:
 
 
 def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
-    """Fill the texels of an atlas. Normals are those of the surface at the level of the fit, if that is finer."""
+    """Compute domain point and normal for each texel of an atlas, at `resolution` × `resolution`.
+
+    Normals are taken from the mesh at the fit's level, if that is finer.
+    """
     bitangents = np.cross(atlas.normals, atlas.tangents[:, :3]) * atlas.tangents[:, 3:]
     s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals
     for _ in range(ring.subdivisions - atlas.subdivisions):
@@ -145,7 +158,7 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
 
 
 def reflectances(ring: FittedObject, s: np.ndarray) -> dict[str, np.ndarray]:
-    """Compute the material at domain points (N, 3): its parameters by name, (N, 3) or (N,)."""
+    """Evaluate BRDF-Net at domain points `s` (N, 3): material parameters by name, each (N, 3) or (N,)."""
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
         parts = [ring.material(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]

@@ -18,7 +18,7 @@ LISTED = 6  #: unknowns of one kind that are listed one by one
 
 
 class Panel(NamedTuple):
-    """The section of the report about calibration: a table, a chart and a warning."""
+    """The report's section about calibration: a table, a chart and a warning."""
 
     rows: list[tuple[str, str, str, str]]  #: quantity, before, after, standard deviation
     chart: str  #: a data URI
@@ -26,7 +26,7 @@ class Panel(NamedTuple):
 
 
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
-    """The section for the captures `before` and `after` the refinement. `refined`: content of calibration.json."""
+    """Make the section from the captures `before` and `after` calibration. `refined`: content of calibration.json."""
     rows = [row(entry) for entry in refined["unknowns"].values()]
     light = refined.get("light", "capture")
     if light != "capture":
@@ -36,7 +36,7 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
-    """The row of an unknown: quantity, before, after, standard deviation."""
+    """Format an entry of calibration.json as (quantity, value before, value after, standard deviation)."""
     if np.size(entry["after"]) > LISTED:
         several = len(entry["after"]), -1
         moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]).reshape(several), axis=1)
@@ -49,14 +49,14 @@ def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
 
 
 def numbers(value: Any, digits: int) -> str:
-    """Numbers as text."""
+    """Format a number or list of numbers with so many `digits`."""
     values = np.ravel(value)
     least = 1e-6 * np.abs(values).max()  # below it is rounding
     return ", ".join(f"{0.0 if abs(v) < least else v:.{digits}g}" for v in values)
 
 
 def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Medians over all photographs of the unknowns that each photograph has."""
+    """Summarise the unknowns that each photograph has by medians over photographs. Returns entries for `row`."""
     entries = list(photographs.values())
     result = []
     for key, what in (("turned_degrees", "cameras turned, median [°]"), ("moved", "and moved, median [scene units]")):
@@ -73,7 +73,10 @@ def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any
 
 
 def held_out_text(held_out: dict[str, Any]) -> str:
-    """A sentence about the held-out photographs. `held_out`: the result of `mi_ring.fitting.validation`."""
+    """Write a sentence about the held-out photographs.
+
+    `held_out`: what `mi_ring.fitting.validation.validate` returned.
+    """
     if not held_out:
         return "not tested: the fit ended early"
     if "unexplained" not in held_out:
@@ -87,7 +90,10 @@ def held_out_text(held_out: dict[str, Any]) -> str:
 
 
 def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]]) -> str:
-    """Cameras and lights from above, and beside it the environment, or the shift or the power of each photograph."""
+    """Draw cameras and lights from above, before and after. Returns an SVG data URI.
+
+    A second plot shows the environment, or the shift or light power of each photograph.
+    """
     moved = [entry["moved_px"] for entry in photographs.values()]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
     light = after.photographs.room if after.photographs.dark else None
@@ -125,7 +131,10 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
 
 
 def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
-    """Draw cameras, viewing directions and lights, projected to the plane of two unit vectors (2, 3)."""
+    """Draw cameras, viewing directions and lights, projected to a plane.
+
+    `plane` (2, 3): two unit vectors that span it.
+    """
     poses = np.stack([shot.camera.to_world for shot in capture.shots])
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T
     axes.quiver(*places.T, *ahead.T, color=colour, angles="xy", scale=12, width=0.004, label=label)

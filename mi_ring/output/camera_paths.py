@@ -83,18 +83,18 @@ class RenderConfig(MaterialOptions):
 
     @property
     def count(self) -> int:
-        """The number of pictures of --turntable, --light-orbit or --flow; 0 if none of them is given."""
+        """Number of pictures that --turntable, --light-orbit or --flow asks for; 0 if none of them is given."""
         return self.turntable or self.light_orbit or self.flow
 
     @property
     def film(self) -> bool:
-        """Whether the output is one film, not a folder of pictures."""
+        """Test whether the output is one film, not a folder of pictures."""
         return self.out.suffix.lower() == ".mp4"
 
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A picture to render: its camera and light, file name and time of the flow."""
+    """A picture to render: camera, light, file name and time of the flow."""
 
     shot: Shot
     name: str  #: of the picture's file
@@ -103,7 +103,10 @@ class RenderedView:
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
-    """Make Mitsuba's integrator; None for `photometric`. Raises InputError if there is none of this name."""
+    """Make the Mitsuba integrator that the options name; None for `photometric`.
+
+    Raises InputError for an unknown name.
+    """
     name = config.integrator or ("path" if config.envmap else "photometric")
     if name == "photometric":
         return None
@@ -159,14 +162,14 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
 
 
 def up_of(capture: Capture, config: RenderConfig) -> np.ndarray:
-    """The up direction (3,), unit length: that of the options, otherwise that of the capture."""
+    """Return the up direction (3,), unit length: from the options, otherwise from the capture."""
     return capture.up if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
 
 
 def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """Turn and zoom a camera, at its position, so that it shows object and start surface of the fit, centred.
+    """Rotate and zoom a camera, without moving it, so that object and start surface fill the picture.
 
-    Also returns the centre (3,) of the object [scene units].
+    Returns (new camera, centre (3,) of the object [scene units]). `up` (3,): up direction.
     """
     s = ring.domain.sample(3)[0].numpy()
     points = np.concatenate([flow_points(ring, s, time) for time in (0.0, 1.0)]).astype(float)
@@ -186,7 +189,7 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
 
 
 def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
-    """Light the object by its scene, or with --envmap by that environment and fixed lamps, without a table."""
+    """Return the object in the scene; with --envmap under that environment and the scene's lamps, without a table."""
     if not config.envmap:
         return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
     to_world = np.eye(4)
@@ -224,9 +227,9 @@ def render_views(
 
 
 def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """Render a picture (H, W, 3) by an integrator of Mitsuba, as the mean of passes: memory does not grow with `spp`.
+    """Render a picture (H, W, 3) with a Mitsuba integrator in several passes, and average these.
 
-    A pass has at most `LANES` rays, but at least one ray per pixel.
+    So memory does not grow with `spp`. A pass has at most `LANES` rays, but at least one per pixel.
     """
     width, height = sensor.camera.size
     at_once = min(spp, max(1, LANES // (width * height)))

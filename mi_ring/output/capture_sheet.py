@@ -48,7 +48,10 @@ def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
 
 
 def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.ndarray, radius: float) -> Image.Image:
-    """Draw the contact sheet: the plan; then photographs with the visual hull, the masks' outlines, invalid pixels."""
+    """Draw the contact sheet: the plan, then the photographs with visual hull, mask outlines and invalid pixels.
+
+    `rows`: quality of the photographs. `center` (3,), `radius`: normalising sphere [scene units].
+    """
     top = plan(capture, center, radius)
     try:
         mesh = capture.hull.surface() if capture.hull else None

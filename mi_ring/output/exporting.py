@@ -64,7 +64,10 @@ def export(
 def require_exportable(
     file: Path, subdivisions: int | None, resolution: int, time: float, metres: float | None
 ) -> str:  # fmt: skip
-    """Check the values and return the suffix of `file`, one of `KINDS`. Raises InputError if one is out of range."""
+    """Check the arguments of `export`. Returns the suffix of `file`, one of `KINDS`.
+
+    Raises InputError if one is invalid.
+    """
     kind = file.suffix.lower()
     if kind not in KINDS:
         raise InputError(f"{file}: must end in {', '.join(KINDS)}")

@@ -15,7 +15,7 @@ from mi_ring.system.files import writing
 
 
 def write_picture(linear: np.ndarray, path: Path) -> None:
-    """Write linear values (H, W, 3): unchanged as EXR, otherwise as 8-bit sRGB."""
+    """Write linear values (H, W, 3): as they are to EXR, otherwise as 8-bit sRGB."""
     exr = path.suffix.lower() == ".exr"
     write_image(linear.astype(np.float32) if exr else to_bytes(linear_to_srgb(linear)), path)
 

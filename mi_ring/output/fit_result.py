@@ -15,7 +15,7 @@ from mi_ring.scene.lights import Light
 
 @dataclass(frozen=True)
 class FitResult:
-    """The state of a fit, finished or not, for its files. It is no copy: use it before the fit continues."""
+    """The state of a fit from which result files are written. It is no copy: use it before the fit continues."""
 
     ring: FittedObject
     surface: Surface  #: of the ring, to draw it
@@ -45,6 +45,6 @@ class FitResult:
         return self.summary and self.summary()
 
     def drawn(self, level: int) -> Surface:
-        """Make the surface at this level of the mesh, ready for rendering."""
+        """Return the surface at this level of the mesh, ready for rendering."""
         self.surface.show(self.ring, *self.ring.domain.sample(level))
         return self.surface

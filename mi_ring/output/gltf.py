@@ -86,7 +86,7 @@ def require_expressible(ring: FittedObject) -> None:
 
 
 def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
-    """Draw the textures of a material, (H, W, 3 or 4) uint8, by their names in glTF."""
+    """Convert a material at the texels to textures, (H, W, 3 or 4) uint8, by their glTF names."""
     ones = np.ones_like(material.roughness)
     images = {
         "baseColorTexture": linear_to_srgb(material.base_color),
@@ -123,7 +123,10 @@ def assemble_glb(
     atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
     metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """Make a GLB file of a mesh, its `textures`, and the BSDF's parameters at its vertices; `seen` (V,) bool."""
+    """Make a GLB file from a mesh, `textures`, and the BSDF's parameters at the vertices (`exact`, by name).
+
+    `seen` (V,) bool: vertices that a photograph shows. Other arguments: as for `glb`.
+    """
     blob = bytearray()
     buffer_views: list[pygltflib.BufferView] = []
     accessors: list[pygltflib.Accessor] = []

@@ -33,7 +33,7 @@ STATES = "done", "running", "interrupted", "waiting", "failed"  #: of fits
 
 
 class Entry(NamedTuple):
-    """A row of the page: a fit."""
+    """A fit, as a row of the page."""
 
     name: str
     state: str  #: of STATES
@@ -56,7 +56,7 @@ def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
 
 
 def row_of(entry: Entry, out: Path) -> dict:
-    """Collect the content of the page's row for a fit."""
+    """Collect what the page shows in the row of a fit."""
     figures: dict[str, str] = {}
     picture, report = None, entry.folder / "report.html"
     with contextlib.suppress(OSError, ValueError):
@@ -69,15 +69,15 @@ def row_of(entry: Entry, out: Path) -> dict:
 
 
 def link_to(file: Path, out: Path) -> str | None:
-    """Make the link to a file from a page in `out`; None if there is no such file."""
+    """Make a link to `file` for a page in the folder `out`; None if there is no such file."""
     return quote(relative_to(out.resolve(), file.resolve())) if file.is_file() else None
 
 
 @functools.lru_cache(maxsize=4096)
 def report_summary(report: Path, modified: int) -> tuple[dict[str, str], str | None]:
-    """Read the numbers of a report, and the prediction of its first photograph as a data URI of a thumbnail.
+    """Read a report. Returns (its numbers by name, thumbnail of the first photograph's prediction as data URI or None).
 
-    `modified`: modification time of the file. The result is cached, because the page is often written again.
+    `modified`: modification time of the file. The result is cached by it, because the page is often rewritten.
     """
     page = report.read_text("utf-8")
     cells = re.findall(r"<tr><th>([^<]*)</th><td>([^<]*)</td></tr>", page)

@@ -32,13 +32,13 @@ class Inspection:
 
 
 def inspect(capture: Capture) -> Inspection:
-    """Inspect a capture. Empty masks are findings and are ignored by the rest of the inspection."""
+    """Check a capture before a fit. Empty masks are reported, then ignored."""
     with progress(None, "inspecting", 4) as bar:
         return inspected(capture, bar.update)
 
 
 def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
-    """Inspect a capture like `inspect`, and call `advance` after each of the four steps."""
+    """Like `inspect`, and call `advance` after each of the four steps."""
     capture, empty = without_empty_masks(capture)
     found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in empty]
     try:

@@ -20,7 +20,7 @@ from mi_ring.system.files import write_file
 
 
 def first_photograph(run: Path) -> tuple[Shot, np.ndarray | None]:
-    """Read the first photograph in a fit's scene.xml, and the light of the room.
+    """Read scene.xml in the results folder `run`. Returns (first photograph, room light (BASIS, 3) or None).
 
     Raises InputError if there is no scene.xml, or if neither the photograph nor the room has a light.
     """

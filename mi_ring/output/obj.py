@@ -12,7 +12,10 @@ from mi_ring.system.files import write_file
 
 
 def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material) -> list[Path]:
-    """Write OBJ, MTL and PNG files; returns their paths. Only texture coordinates are split along seams."""
+    """Write OBJ, MTL and PNG files. Returns their paths.
+
+    Only texture coordinates, not vertices, are duplicated at seams.
+    """
     baked, files = gltf.textures(material, texels), {}
     for name, image in {
         "diffuse": baked["baseColorTexture"], "normal": baked["normalTexture"],

@@ -17,7 +17,8 @@ def write_mesh(
 ) -> float | None:
     """Write the surface as PLY in scene units, with the BSDF's parameters as vertex attributes (vertex_diffuse, …).
 
-    With `views`, vertex_seen is 1 where a view shows the object; returns the share of the area that no view shows.
+    With `views`, the attribute vertex_seen is 1 where a view shows the object, and the share of the area that no view
+    shows is returned; otherwise None.
     """
     s, faces = ring.domain.sample(subdivisions)
     with torch.no_grad():

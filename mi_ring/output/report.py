@@ -46,7 +46,7 @@ SHIFTED, ALL_SHIFTED = 1.0, 0.25  # shift of one photograph relative to the othe
 
 @dataclass
 class PhotographPanel:
-    """One photograph of the page: its numbers and pictures as data URIs."""
+    """One photograph of the report: its numbers, and its pictures as data URIs."""
 
     name: str
     psnr: float
@@ -59,7 +59,10 @@ class PhotographPanel:
 
 
 def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
-    """Make the page of a fit. `glb`: the object, for the viewer. `unseen`: share of area that no photograph shows."""
+    """Make the report of a fit as HTML. `glb`: the object, for the viewer.
+
+    `unseen`: share of area that no photograph shows.
+    """
     capture, ring, refined = result.capture, result.ring, result.calibration
     surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
@@ -104,7 +107,7 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
 
 
 def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
-    """The viewer's first view, in scene units: `up`, `eye`, and the `irradiance` (RGB) at the object's centre."""
+    """Choose the viewer's start: `up`, `eye` and the `irradiance` (RGB) at the object's centre, in scene units."""
     eye = capture.shots[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
     if not irradiance.any():  # photographs have no lights of their own
@@ -163,19 +166,22 @@ def fit_findings(
 
 
 def middle(values: Sequence[float] | Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Median of values (n, ...), and their standard deviation estimated by the median absolute deviation."""
+    """Median of values (n, ...) over n.
+
+    Returns (median, robust standard deviation from the median absolute deviation).
+    """
     median = np.median(values, axis=0)
     return median, 1.4826 * np.median(np.abs(np.subtract(values, median)), axis=0)
 
 
 def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
-    """List names and numbers of the lowest (rank, name, number) in one line; empty if there are none."""
+    """List the lowest of tuples (rank, name, number) in one line, at most `most`; empty if there are none."""
     ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
     return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
 
 
 def sides(x: float, y: float) -> str:
-    """Describe a shift [px] in words: how far right or left, up or down."""
+    """Describe a shift of `x`, `y` [px] in words: how far right or left, up or down."""
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
@@ -188,7 +194,7 @@ class PredictedPhotograph(NamedTuple):
 
 
 def scale_of(result: FitResult, size: tuple[int, int]) -> int:
-    """The factor by which photographs of this size are reduced for the comparison, as in the last stage of the fit."""
+    """Factor by which photographs of this size are reduced before comparison, as in the last stage of the fit."""
     return -(-size[0] // result.width)
 
 
@@ -211,12 +217,12 @@ def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Pr
 def panels_of(
     result: FitResult, index: np.ndarray, predictions: Sequence[PredictedPhotograph]
 ) -> list[tuple[PhotographPanel, float]]:
-    """Make the panels of several photographs, each by `panel_of`."""
+    """Call `panel_of` for the photographs `index`, and list the results."""
     return [panel_of(result, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
 def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tuple[PhotographPanel, float]:
-    """Make the panel of photograph `k`; also returns its mean squared error in sRGB over the `comparable` pixels."""
+    """Make the panel of photograph `k`. Returns (panel, mean squared sRGB error over the `comparable` pixels)."""
     capture, brdf_net = result.capture, result.ring.brdf_net
     scale = scale_of(result, capture.shots[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps
@@ -259,7 +265,10 @@ def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tupl
 
 
 def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[float, float] | None:
-    """Find the shift (right, down) [px] of `photo` (H, W, 3) from `guess` within `inside` (H, W); None if black."""
+    """Estimate the translation (right, down) [px] from `guess` to `photo`, both (H, W, 3), inside a mask (H, W).
+
+    None if the pictures are black there.
+    """
     if not (photo.any() and guess.any() and inside.any()):
         return None
     rows, columns = ndimage.find_objects(ndimage.binary_dilation(inside, iterations=8).astype(np.uint8))[0]

@@ -54,7 +54,7 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
 
 
 def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """Make the results folder like `prepare_folder`, but the scene file may be in it."""
+    """Like `prepare_folder`, but the folder may contain the scene file."""
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
@@ -66,7 +66,7 @@ def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) 
 
 
 def move_aside(folder: Path) -> None:
-    """Rename a folder, so that its name is free."""
+    """Rename an existing folder, so that its name becomes free."""
     aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
     folder.rename(aside)
     print(f"The results that were in {folder}/ are now in {aside}/")
@@ -92,12 +92,15 @@ def save(folder: Path, result: FitResult) -> None:
 
 
 def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
-    """Make scene.xml of a fit of these photographs. Raises InputError for a scene that cannot be rewritten."""
+    """Make the content of scene.xml for a fit, without its calibration.
+
+    Raises InputError if the scene cannot be rewritten.
+    """
     return fitted_scene_xml(capture.path, folder, ring.subdivisions, ring.bsdf)
 
 
 def write_log(folder: Path, entries: Iterable[dict]) -> None:
-    """Write log.jsonl."""
+    """Write all `entries` to log.jsonl in `folder`."""
     write_file(folder / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries))
 
 
@@ -109,7 +112,7 @@ def add_to_log(folder: Path, entry: dict) -> None:
 
 
 def read_log(folder: Path) -> list[dict]:
-    """Read the entries of log.jsonl, without a last line that a kill or a full disk cut off."""
+    """Read the entries of log.jsonl. An incomplete last line, after a kill or a full disk, is left out."""
     entries = []
     for line in (folder / "log.jsonl").read_bytes().splitlines():
         with contextlib.suppress(ValueError, RecursionError):
@@ -118,7 +121,7 @@ def read_log(folder: Path) -> list[dict]:
 
 
 def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
-    """Write inputs.png: photographs with the start surface in green. It shows wrong masks and poses."""
+    """Write inputs.png: photographs with the start surface in green. It makes wrong masks and poses visible."""
     some = capture.spread()
     columns = min(10, len(some))
     cell, line = 160, 16
@@ -140,7 +143,7 @@ def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
 def write(folder: Path, result: FitResult, scene: bytes) -> None:
     """Write ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, finished or not.
 
-    `scene`: its `fitted_scene`, with cameras and lights as before the fit.
+    `scene`: what `fitted_scene` returned, with cameras and lights as before the fit.
     """
     ring, capture = result.ring, result.capture
     write_state(ring_state(ring, result.settings), folder / "ring.pt")
@@ -168,9 +171,9 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
 
 
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
-    """Write the masks of photographs `index` as PNG, each named like its photograph with .png added.
+    """Write the masks of photographs `index` as PNG. Each has its photograph's name with .png added.
 
-    Returns the masks' names, by index, as a scene beside `folder` has them.
+    Returns file names by index, relative to a scene file beside `folder`.
     """
     names = {}
     for k in index:

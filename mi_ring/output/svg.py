@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 
 def svg_uri(figure: Figure) -> str:
-    """Encode a figure as an SVG data URI; equal figures give equal URIs."""
+    """Encode a figure as an SVG data URI. Equal figures give equal URIs."""
     buffer = io.BytesIO()
     with rc_context({"svg.hashsalt": "mi_ring"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})

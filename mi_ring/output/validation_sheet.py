@@ -14,7 +14,10 @@ LEGEND = "Each photograph by its own exposure. Differences: red where photometri
 
 
 def strip(row: Comparison, pictures: Pictures) -> Image.Image:
-    """Draw the row of one photograph, at its own exposure. Differences are red where photometric is brighter."""
+    """Draw one photograph's row of pictures, with an exposure of its own.
+
+    Differences are red where photometric is brighter.
+    """
     photometric, unshadowed, path, direct = (p.mean(0) for p in vars(pictures).values())
     white = np.quantile(path[path > 0], 0.98) if (path > 0).any() else 1.0
 
@@ -46,7 +49,7 @@ def strip(row: Comparison, pictures: Pictures) -> Image.Image:
 
 
 def validation_sheet(strips: list[Image.Image]) -> bytes:
-    """Join the rows to a contact sheet, as PNG: several stacks side by side, so that the sheet is about square."""
+    """Arrange the rows in a contact sheet that is about square. Returns a PNG file."""
     width, height = strips[0].width + 12, max(line.height for line in strips)
     stacks = max(1, round(np.sqrt(len(strips) * height / width)))
     rows = -(-len(strips) // stacks)

@@ -75,7 +75,7 @@ def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, fa
 
 
 class Observations(NamedTuple):
-    """n samples of white paper, each with its camera pose and exposure."""
+    """n samples of white paper, each with the pose of its camera and the axes of its flash."""
 
     points: np.ndarray  #: (n, 3)
     colours: np.ndarray  #: (n, 3) logarithms

@@ -52,7 +52,7 @@ Cameras = Mapping[str, tuple[Lens, Pose]]  #: by the photograph's name
 
 
 class Similarity(NamedTuple):
-    """The similarity x ↦ scale · rotation x + shift from the cameras' frame to the sheet's frame [mm], and its quality."""
+    """The similarity x ↦ scale · rotation x + shift from the cameras' frame to the sheet's [mm], and its errors."""
 
     scale: float
     rotation: np.ndarray  #: (3, 3)

@@ -248,7 +248,7 @@ def match_again(files: Collection[str], folder: Path, progress: Progress) -> boo
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
-    """Share of matched pairs of grey files that are from one viewpoint: a homography maps all features."""
+    """Share of the `pairs` of grey files that match and are from one viewpoint: all features move alike."""
     with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
     asked, static = set(map(frozenset, pairs)), 0

@@ -173,9 +173,9 @@ class TableAppearance:
         self.texture = np.concatenate([nan_median(self.observe_all(part)) for part in progress(parts, "table")])
 
     def observe(self, number: int, texels: np.ndarray) -> np.ndarray:
-        """Log radiance (N, 3) of the texels with indices `texels` (N,) in view `number`, without the view's illumination.
+        """Log radiance (N, 3) of the texels with indices `texels` (N,) in view `number`; NaN where not shown.
 
-        NaN where the view does not show them.
+        The illumination of the view is subtracted.
         """
         row, column, inside = self.views[number].project(self.grid.points[texels])
         if self.hidden:
@@ -284,7 +284,10 @@ def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def match_pattern(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Mask (H, W) uint8 of pixels where log radiance `seen` (H, W) correlates with that of the `table` (H, W; may be NaN)."""
+    """Mask (H, W) uint8 of pixels where log radiance `seen` (H, W) correlates with that of the `table`.
+
+    `table` (H, W): log radiance without the object; NaN where it is unknown.
+    """
     known = np.isfinite(table)
     mean = partial(cv2.blur, ksize=(WINDOW, WINDOW))
     a, b = seen.astype(np.float32), np.where(known, table, 0).astype(np.float32)

@@ -97,29 +97,29 @@ class CookTorrance(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def parameters(self, si, active=True):
-        """The parameters (ρᵈ, ρᵞ, r) at surface interactions."""
+        """Evaluate the parameters at surface interactions: (ρᵈ, ρᵞ, r)."""
         diffuse = self.textures["diffuse"].eval(si, active)
         specular = self.textures["specular"].eval_1(si, active)
         return diffuse, specular, dr.maximum(self.textures["roughness"].eval_1(si, active), MIN_ROUGHNESS)
 
     @staticmethod
     def front(si, wo):
-        """Are the viewer and `wo` on the front side, by the shading normal or by the geometric normal?"""
+        """Test whether viewer and `wo` are on the front side, by the shading normal or by the geometric normal."""
         n = si.to_local(si.n)
         return ((si.wi.z > 0) | (dr.dot(si.wi, n) > 0)) & (wo.z > 0)
 
     def microfacets(self, r):
-        """Mitsuba's D / π, G and visible normals for a roughness."""
+        """Make Mitsuba's microfacet distribution for roughness `r`: D / π and G of equation 1, and visible normals."""
         return mi.MicrofacetDistribution(DISTRIBUTIONS[self.distribution], r, True)
 
     def with_fresnel(self, specular, cosine):
-        """ρᵞ for o·h = `cosine`."""
+        """Apply the Fresnel term to ρᵞ (`specular`). `cosine`: o·h."""
         if not self.fresnel:
             return specular
         return specular + dr.maximum(0.25 - specular, 0) * dr.power(1 - dr.clip(cosine, 0, 1), 5)
 
     def reflected(self, ctx, si, wo, diffuse, specular, r, active):
-        """B (n·i) of equation 1 [1/sr]."""
+        """Evaluate equation 1 times the cosine, B (n·i) [1/sr]."""
         o, i = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (si.wi, wo))
         h = dr.normalize(wo + si.wi)
         h.z = dr.abs(h.z)  # at the contour h may be below the surface, where Mitsuba's D is 0
@@ -131,7 +131,7 @@ class CookTorrance(mi.BSDF):
         return dr.select(active & self.front(si, wo), value * i.z, 0)
 
     def lobes(self, si, order, active=True):
-        """How the surface reflects light that varies slowly: for each lobe its direction in the world and its factors.
+        """Reflection of slowly varying light. Returns for each lobe (its world direction, its factors).
 
         The `order` + 1 factors are for the degrees of spherical harmonics about this direction. The diffuse lobe is
         that of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The
@@ -213,7 +213,7 @@ class CookTorrance(mi.BSDF):
 
 
 def cosine_factors(order):
-    """The factors by which a surface of B = 1 reflects the degrees of spherical harmonics, up to `order`."""
+    """Factors by which a surface of B = 1 multiplies spherical harmonics of degree 0 to `order`."""
     factors = [math.pi, 2 * math.pi / 3]
     for degree in range(2, order + 1):
         half = degree // 2
@@ -262,7 +262,7 @@ def gloss_table(variant, distribution, order):
 
 
 def legendre(x, order):
-    """The Legendre polynomials of x up to a degree, by Bonnet's recursion."""
+    """Evaluate the Legendre polynomials of degree 0 to `order` at x, by Bonnet's recursion."""
     found = [mi.Float(1), x]
     for n in range(1, order):
         found.append(((2 * n + 1) * x * found[n] - n * found[n - 1]) / (n + 1))

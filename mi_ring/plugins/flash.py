@@ -8,7 +8,7 @@ from mi_ring.rendering.photograph_lights import DISTANT, flash_falloff
 
 
 def flash_light(it, sample=(0, 0), active=True):
-    """The light of the current photograph at interactions `it`: (DirectionSample3f, radiance · d⁻²).
+    """Sample the light of the photograph being rendered, at interactions `it`: (DirectionSample3f, radiance · d⁻²).
 
     It is black while another kind of sensor is rendered.
     """
@@ -25,7 +25,7 @@ def flash_light(it, sample=(0, 0), active=True):
 
 
 class InvisibleEmitter(mi.Emitter):
-    """Base class of emitters that light surfaces, but that rays do not see."""
+    """Base class of emitters that light surfaces but are invisible to rays."""
 
     def __init__(self, props):
         super().__init__(props)

@@ -80,7 +80,7 @@ class Merl(mi.BSDF):
         self.m_flags = self.m_components[0]
 
     def reflected(self, si, wo, active):
-        """f (n·i) [1/sr]."""
+        """Evaluate the BRDF times the cosine, f (n·i) [1/sr]."""
         h = dr.normalize(si.wi + wo)
         sin = dr.sqrt(h.x * h.x + h.y * h.y)
         across = sin > 1e-7

@@ -140,14 +140,14 @@ class Photograph(mi.Sensor):
 
     @property
     def camera(self) -> Camera:
-        """The camera as plain values, from the plugin's current parameters."""
+        """Return the camera as plain numbers, from the plugin's current parameters."""
         matrix, distortion = np.array(self.to_world.matrix).reshape(4, 4), float(np.ravel(self.distortion)[0])
         size = tuple(map(int, self.film().size()))
         return Camera(matrix, np.array(self.focal).ravel(), np.array(self.centre).ravel(), size, distortion)
 
     @property
     def shot(self) -> Shot:
-        """The photograph as plain values, from the plugin's current parameters.
+        """Return the photograph as plain data, from the plugin's current parameters.
 
         Raises SceneError if its light is neither a point light nor a distant one.
         """

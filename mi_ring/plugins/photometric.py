@@ -63,7 +63,7 @@ class Photometric(ADIntegrator):
         return radiance, si.is_valid(), [], None
 
     def require_attributes(self, scene):
-        """Check the mesh attributes of all shapes, once per scene, by `mesh_attributes.require_attributes`."""
+        """Check, once per scene, that all meshes have the attributes that their BSDFs read."""
         shapes = scene.shapes()  # keeping the scene, which holds this integrator, would be a cycle
         if shapes != self.checked:
             for shape in shapes:
@@ -71,7 +71,7 @@ class Photometric(ADIntegrator):
             self.checked = shapes
 
     def differentiable(self, scene, sensor, seed, spp):
-        """Render the image of `render`, attached to all parameters, with the boundary terms of moving edges."""
+        """Render the image with gradients for all parameters, including the boundary terms of moving edges."""
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         if not (mi.is_rgb and isinstance(sensor, Photograph)):

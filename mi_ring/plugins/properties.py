@@ -8,7 +8,7 @@ import numpy as np
 
 
 def beside_scene(name: str) -> Path:
-    """The path of a file that a scene names: relative to the scene's folder, or without one to the working folder."""
+    """Resolve a file name in a scene relative to the scene's folder; without one, to the working folder."""
     return Path(str(mi.file_resolver()[0])) / name
 
 
@@ -16,9 +16,9 @@ LARGEST = 1e18  #: number whose square is finite in float32
 
 
 def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
-    """Read a number from a plugin's properties. Its square must be finite, and if `positive` its inverse, too.
+    """Read a number from a plugin's properties. Its square must be finite; with `positive` its inverse, too.
 
-    Raises ValueError if the property is anything else. `default`: the value if it is missing.
+    `default`: the value if the property is missing. Raises ValueError for anything else.
     """
     value = props.get(name, default)
     least = 1 / LARGEST if positive else -LARGEST
@@ -29,7 +29,10 @@ def number(props, name: str, default: float | None = None, positive: bool = Fals
 
 
 def vector(props, name: str, kind: str) -> np.ndarray | None:
-    """Read a <point> or <vector> (`kind`) from a plugin's properties: (3,), or None. Otherwise raises ValueError."""
+    """Read the <point> or <vector> (`kind`) `name` from a plugin's properties: (3,), or None if missing.
+
+    Raises ValueError for anything else.
+    """
     if name not in props:
         return None
     found = np.array(props[name]).ravel()
@@ -39,7 +42,7 @@ def vector(props, name: str, kind: str) -> np.ndarray | None:
 
 
 def number_list(props, name: str, counts: Sequence[int]) -> list[float]:
-    """Read a text of numbers, as many as one of `counts`, from a plugin's properties. Otherwise raises ValueError."""
+    """Read a string of numbers from a plugin's properties. Raises ValueError unless `counts` contains their number."""
     text = str(props.get(name, ""))
     try:
         values = [float(word) for word in text.replace(",", " ").split()]

@@ -11,28 +11,27 @@ from torch.autograd.function import once_differentiable
 
 
 def to_drjit(tensor: Tensor) -> mi.Float:
-    """Convert a tensor to a flat Dr.Jit Float of the same memory (DLPack). Neither side may write to it."""
+    """Convert a tensor to a flat Dr.Jit Float that shares its memory (DLPack). Neither side may write to it."""
     return mi.Float(tensor.detach().contiguous().ravel())
 
 
 def to_torch(array: mi.Float) -> Tensor:
-    """Convert a Dr.Jit Float to a tensor (n,) of the same memory (DLPack). Neither side may write to it."""
+    """Convert a Dr.Jit Float to a tensor (n,) that shares its memory (DLPack). Neither side may write to it."""
     return dr.detach(array).torch()
 
 
 def evaluated(arrays: Sequence[mi.Float]) -> list[Tensor]:
-    """Compute Dr.Jit Floats together, by one kernel, and convert each to a tensor as `to_torch` does."""
+    """Evaluate Dr.Jit Floats in one kernel, and convert each to a tensor as `to_torch` does."""
     dr.eval(arrays)
     return [to_torch(array) for array in arrays]
 
 
 def differentiable(program: Callable, tensors: Sequence[Tensor], target) -> tuple[Tensor, ...]:
-    """Run a Dr.Jit program and return its output as tensors (n,), differentiable with respect to `tensors`.
+    """Run a Dr.Jit program. Returns its output as tensors (n,) that are differentiable with respect to `tensors`.
 
-    `program` takes a list of flat Floats, those attached whose tensors require a gradient, and returns a list of
-    Floats. It writes its input to `target`, which counts this in `written`.
-
-    The backward pass raises RuntimeError the second time, and if `target` was written again since.
+    `program`: function from a list of flat Floats (attached where the tensor requires a gradient) to a list of Floats.
+    It writes its input to `target`, which counts writes in `written`. The backward pass raises RuntimeError if it runs
+    twice, or if `target` was written again in between.
     """
     return _Differentiable.apply(program, target, *tensors)
 

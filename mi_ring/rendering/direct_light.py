@@ -10,12 +10,12 @@ MIN_COSINE = 1e-3  #: the least cosine between viewer and normal; smaller ones a
 
 
 def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
-    """Compute the radiance that leaves surface interactions `si` toward the viewer, attached.
+    """Compute the radiance that surface interactions `si` send to the viewer; attached for gradients.
 
-    `light(si)`, or None: (DirectionSample3f, radiance · d⁻²) of the photograph's own light. Other emitters take one
-    sample each, by `next_2d`. `shadows`: does the own light cast shadows? Other emitters always do.
-    `room_radiance(si)`, if it is not None, is radiance to add. `rooms` samples the scene's `room` emitters;
-    `render_indirect` has their light with less noise.
+    `light(si)`: (DirectionSample3f, radiance · d⁻²) of the photograph's own light; or None. Other emitters get one
+    sample each, from `next_2d`. `shadows`: does the own light cast shadows? Others always do. `room_radiance(si)`, if
+    not None, is added. `rooms`: also sample the scene's `room` emitters, whose light `render_indirect` has with less
+    noise.
     """
     context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
     # At an outline interpolated normals turn away before the faces do. A black strip there would be another edge.
@@ -40,7 +40,7 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
 
 
 def light_visible(scene, si, ds, active=True):
-    """Is there nothing between the surface at `si` and the light at the direction sample `ds`?"""
+    """Test whether nothing is between the surface at `si` and the light at direction sample `ds`."""
     n, d = dr.detach(si.n), dr.detach(ds.d)
     origin = dr.detach(si.p) + n * dr.mulsign(ray_offset(dr.detach(si.p), dr.detach(si.t)), dr.dot(n, d))
     to_light = dr.detach(ds.p) - origin
@@ -51,9 +51,9 @@ def light_visible(scene, si, ds, active=True):
 
 
 def next_2d(seed, lanes, stream=None):
-    """Make a function that returns random points in [0, 1)². Each lane has its own random numbers.
+    """Make a random number generator: a function that returns points in [0, 1)², independent for each lane.
 
-    `stream` (UInt32): the number of each lane's random stream; by default the number of the lane.
+    `stream` (UInt32): random stream of each lane; default: the number of the lane.
     """
     # Hashed as in Mitsuba's samplers: without this, neighbouring streams are correlated.
     stream = dr.arange(mi.UInt32, lanes) if stream is None else stream
@@ -63,9 +63,10 @@ def next_2d(seed, lanes, stream=None):
 
 
 def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
-    """Trace rays: [R, G, B, coverage], each lane lit by the light of its photograph `view`; 0 where not `active`.
+    """Trace camera rays. Returns [R, G, B, coverage] of each lane; 0 where not `active`.
 
-    The light of the photographs' room is included without occlusion. `render_indirect` has the occlusion.
+    Each lane is lit by the light of its photograph `view`. Room light is included without occlusion; `render_indirect`
+    adds the occlusion.
     """
     shadows = shadows and photographs.casts_shadows
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)

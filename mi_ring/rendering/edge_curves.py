@@ -13,16 +13,19 @@ OUTLINE_OFFSET, SHADOW_OFFSET = 1e-4, 1e-2
 
 
 def ray_offset(point, distance):
-    """How far from `point` a ray must start in order not to hit the surface that it leaves [scene units].
+    """How far from `point` a ray must start so that it does not hit the surface it leaves [scene units].
 
-    It is proportional to the rounding error of the point, which a ray of length `distance` has found.
+    It is proportional to the rounding error of the point, which was found by a ray of length `distance`.
     """
     return RELATIVE_OFFSET * (dr.max(dr.abs(point)) + distance)
 
 
 @dataclass
 class EdgeSamples:
-    """Samples of curves in space: outlines, creases and borders of shapes. Photographs may have different numbers."""
+    """Samples of curves in space: outlines, creases and borders of shapes.
+
+    Their number may differ between photographs.
+    """
 
     view: mi.UInt32  #: the photograph
     lane: mi.UInt32  #: the number of the sample, the same whichever photographs are rendered together
@@ -37,7 +40,10 @@ class EdgeSamples:
 # Curves of such shapes in local coordinates: (p, dp/dt, a point of the shape beside p) as functions of t in [0, 1) and
 # of the eye e, which is a point for w = 1 and a direction for w = 0.
 def circle(u, v, t):
-    """The unit circle in the plane of the unit vectors `u` and `v`: (point, its derivative by `t`), `t` in [0, 1)."""
+    """The unit circle in the plane of unit vectors `u`, `v`.
+
+    Returns (point, derivative with respect to `t` in [0, 1)).
+    """
     s, c = dr.sincos(2 * dr.pi * t)
     return u * c + v * s, 2 * dr.pi * (v * c - u * s)
 
@@ -95,9 +101,9 @@ CURVES = {
 
 
 def outline_of(shape, eye, views, seed, before=0) -> list[EdgeSamples]:
-    """Sample the outline and border of a shape that is not a mesh, as the eyes of `views` photographs see it.
+    """Sample outline and border of a shape that is not a mesh, as seen in each of `views` photographs.
 
-    `eye`: see `Edges`; `before`: number of photographs before these, see `Photographs`.
+    `eye`: see `Edges`. `before`: number of photographs before these, see `Photographs`.
     """
     to_world = mi.traverse(shape)["to_world"]
     curves = []

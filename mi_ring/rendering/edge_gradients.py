@@ -11,13 +11,13 @@ EDGE_ROUNDINGS = 16  #: the least distance to rays beside an edge, in rounding e
 
 
 def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
-    """The boundary terms of photographs: (where [px], view, step, active) of samples along each curve.
+    """Compute the boundary terms of photographs, for each curve as (where [px], view, step, active) of its samples.
 
-    An edge that moves by n·dq [px] changes radiance over length · n·dq square pixels: from L_beyond to L_before. So
-    dI = (L_before − L_beyond) · n·dq · length. Both are traced along rays beside the edge, which see occlusion,
-    background, coverage and shadows as the camera does. `step`, [R, G, B, coverage], is zero; its derivative is dI, and
-    must be added to the pixel at `where`. Only edges in `window` count, the (lowest, highest) corner [px] of what is
-    rendered; by default all of it.
+    An edge that moves by n·dq [px] sweeps length · n·dq square pixels, where radiance changes from L_beyond to
+    L_before. So dI = (L_before − L_beyond) · n·dq · length. Both are traced along rays beside the edge, which see
+    occlusion, background, coverage and shadows as the camera does. `step`, [R, G, B, coverage], is zero; its derivative
+    is dI, to be added to the pixel at `where`. `window`: (lowest, highest) corner [px] of the rendered part; edges
+    outside are left out. Default: all.
     """
     window = window or (mi.Point2f(0), mi.Point2f(photographs.size))
     views, before = len(photographs), photographs.before
@@ -69,9 +69,10 @@ def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window)
 
 
 def cast_shadow(scene, curve: EdgeSamples, light, camera) -> EdgeSamples:
-    """Project a curve away from the light: where rays from the light that graze the curve hit the scene.
+    """Project a curve along rays from the light onto the scene: the edge of the shadow that it casts.
 
-    Attached to the light, to the curve and to the surface that the shadow falls on. `light` and `camera` are eyes.
+    The result is attached to the light, to the curve and to the surface under the shadow. `light`, `camera`: see
+    `Edges`.
     """
     where, finite = light(curve.view)
     d = dr.normalize(dr.select(finite, curve.point - where, -where))

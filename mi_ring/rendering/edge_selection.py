@@ -12,10 +12,10 @@ SAMPLES, MIN_SAMPLES = 4, 2048  #: per edge of a mesh, and at least for all edge
 
 
 class Edges:
-    """The edges of all shapes of a scene. Methods find those that are outlines for an eye.
+    """The edges of all shapes in a scene. Methods find those that are outlines for an eye.
 
-    An eye is a camera or a light: a function of the photograph (UInt32) that returns (Vector3f, Bool), a point and
-    True, or the direction toward an eye that is infinitely far away and False. It may be attached.
+    An eye is a camera or a light: a function of the photograph (UInt32). It returns (Vector3f, Bool): a position and
+    True, or the direction toward an infinitely distant eye and False. It may be attached.
 
     Raises SceneError for a kind of shape whose outline is not known.
     """
@@ -47,7 +47,7 @@ class Edges:
 
     @classmethod
     def of(cls, scene, known: "Edges | None" = None) -> "Edges":
-        """Find the edges of a scene. Returns `known`, without any work, if its shapes and faces are still the same."""
+        """Find the edges of a scene. Returns `known` itself if the scene's shapes and faces have not changed since."""
         if known is not None and list(scene.shapes()) == known.shapes:
             now = (mesh.faces_buffer() for mesh in known.meshes)
             if all(a.index == b.index for a, b in zip(now, known.buffers)):
@@ -55,12 +55,12 @@ class Edges:
         return cls(scene)
 
     def positions(self):
-        """The vertices of all meshes as one Float, attached."""
+        """The vertex positions of all meshes as one Float, attached."""
         buffers = [mesh.vertex_positions_buffer() for mesh in self.meshes]
         return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
 
     def fronts(self, eye, views):
-        """Which triangles face the eye: Bool, all triangles for photograph 0, then for photograph 1, …"""
+        """Test which triangles face the eye: Bool over all triangles for photograph 0, then for photograph 1, …"""
         count = dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views)
         where, finite = eye(lane // count)
@@ -72,9 +72,10 @@ class Edges:
         return front
 
     def sides(self, fronts, lanes=None, views=1):
-        """Which triangles beside edges face the eye, by `fronts`: (edge, does its first triangle, does its second?).
+        """For each lane, return (edge, does its first triangle face the eye?, does its second?).
 
-        For `lanes` (UInt32: photograph · number of edges + edge), or for all edges in `views` photographs.
+        `fronts`: from `fronts`. `lanes` (UInt32): photograph · number of edges + edge. Default: all edges in `views`
+        photographs.
         """
         count, triangles = dr.width(self.kind), dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views) if lanes is None else lanes
@@ -85,7 +86,7 @@ class Edges:
         return edge, first, second
 
     def sample(self, lanes, seed, before=0, shadow=False) -> EdgeSamples:
-        """Sample points on the edges `lanes` (see `sides`), stratified. `shadow`: are they edges of shadows?"""
+        """Sample points on edges, stratified. `lanes`: see `sides`. `shadow`: are they edges of shadows?"""
         count = dr.width(self.kind)
         each = max(SAMPLES, MIN_SAMPLES // count)
         local = dr.arange(mi.UInt32, dr.width(lanes) * each)
@@ -100,7 +101,7 @@ class Edges:
         return EdgeSamples(chosen // count, lane, p, piece, self.middle(edge), mi.Bool(True), OUTLINE_OFFSET, shadow)
 
     def middle(self, edge):
-        """The centre of the two triangles beside an edge, detached."""
+        """The mean of the centres of both triangles at an edge, detached."""
         positions, corners = dr.detach(self.positions()), mi.Point3f(0)
         for face in (self.f0, self.f1):
             for vertex in dr.gather(mi.Point3u, self.corners, dr.gather(mi.UInt32, face, edge)):
@@ -108,7 +109,10 @@ class Edges:
         return corners
 
     def outlines(self, eye, views, seed, before=0):
-        """Sample all edges that can be outlines or creases for the eyes of `views` photographs: (curves, `fronts`)."""
+        """Sample all edges that may be outlines or creases for the `eye` in `views` photographs.
+
+        Returns (curves, the eye's `fronts`).
+        """
         curves = [curve for shape in self.others for curve in outline_of(shape, eye, views, seed, before)]
         fronts = None
         if self.meshes:
@@ -121,11 +125,11 @@ class Edges:
         return curves, fronts
 
     def shadow_casters(self, light, views, seed, seen, before=0):
-        """Sample edges that cast the edge of a shadow (casters), or are the edge of a shadow themselves (terminators).
+        """Sample edges that cast the edge of a shadow (casters), and those that are one themselves (terminators).
 
-        `light` is an eye; `seen` are the `fronts` of the cameras. Casters are the outlines for the light. Terminators
-        are the casters inside the object for the camera: both triangles face it. The triangle that does not face the
-        light is black, even where interpolated normals face the light.
+        Returns (casters, terminators) for the eye `light`. `seen`: `fronts` of the cameras. Casters are the outlines
+        for the light. Terminators are casters of which the camera sees both triangles. The triangle that does not face
+        the light is black, even where interpolated normals face the light.
         """
         casters = [curve for shape in self.others for curve in outline_of(shape, light, views, seed, before)]
         terminators = []
@@ -144,7 +148,10 @@ class Edges:
 
 
 def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
-    """Find the edges of a mesh: (5, E), vertices v0 and v1, triangles with (v0, v1) and with (v1, v0), and the kind."""
+    """Find the edges of a mesh.
+
+    Returns (5, E): vertices v0 and v1, triangles with (v0, v1) and with (v1, v0), the kind.
+    """
     weld = np.arange(mesh.vertex_count())
     table = paired_edges(faces, weld)
     if (table[4] == BORDER).any():  # some may be seams, where vertices are duplicated
@@ -157,7 +164,7 @@ def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
 
 
 def paired_edges(faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
-    """Make the `edge_table` of a mesh with smooth normals. Vertices of equal `weld` (V,) are the same point."""
+    """Make the `edge_table` of a mesh with smooth normals. Vertices with equal `weld` (V,) are the same point."""
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, 1).ravel().astype(np.int64)
     triangle = np.repeat(np.arange(len(faces)), 3)
     a, b = weld[start], weld[end]

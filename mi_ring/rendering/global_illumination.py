@@ -20,9 +20,9 @@ TABLE_WIDTH, TABLE_PATHS = 128, 3  #: the same with a table, whose pattern gloss
 
 @dataclass(frozen=True)
 class GlobalIllumination:
-    """Interreflection and room light of N pictures, in small pictures of h × w pixels.
+    """Interreflection and room light of N photographs, rendered as small pictures of h × w pixels.
 
-    The small pictures are scaled up to H × W pixels, those of the picture of the direct light. `transfer` is the
+    The small pictures are scaled up to H × W pixels, the size at which direct light is rendered. `transfer` is the
     radiance transfer of "Precomputed Radiance Transfer" (Sloan, Kautz and Snyder 2002).
     """
 
@@ -39,7 +39,7 @@ class GlobalIllumination:
         cls, surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int | None = None,
         paths: int | None = None, indirect: bool = True, harmonics: Sequence[int] = (),
     ) -> "GlobalIllumination":  # fmt: skip
-        """Render interreflection and `transfer` of some harmonics for the surface as last written, without gradients.
+        """Render interreflection, and the `transfer` of some `harmonics`, for the current surface, without gradients.
 
         `photographs`: as they were rendered. `coverage` (N, H, W): of the large pictures. `width`: largest width of the
         small pictures [px]; `paths`: paths per pixel. This light varies slowly, and a few good pixels are better than
@@ -66,11 +66,14 @@ class GlobalIllumination:
         return self.upsampled(self.radiance)
 
     def room_light(self, room: Tensor) -> Tensor:
-        """Linear radiance (N, H, W, 3) that a room, harmonics (BASIS, 3), adds to large pictures without room light."""
+        """Linear radiance (N, H, W, 3) that room light, `room` (BASIS, 3), adds to the large pictures."""
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
 
     def occlusion(self, room: Tensor) -> Tensor:
-        """What to add (N, H, W, 3) to pictures with unhidden room light (BASIS, 3): its shadow and interreflection."""
+        """Radiance (N, H, W, 3) that pictures with unoccluded room light lack: its shadows and interreflection.
+
+        `room` (BASIS, 3): spherical harmonics. The shadows are negative.
+        """
         difference = self.transfer - self.unoccluded
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))
 

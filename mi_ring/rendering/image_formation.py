@@ -9,11 +9,12 @@ from mi_ring.rendering.photographs import center_rays, pixel_rays
 
 
 def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, pixels=None):
-    """Render all selected photographs in one launch: [R, G, B, coverage], Floats of N·H·W pixels, attached.
+    """Render the selected photographs in one launch. Returns [R, G, B, coverage]: Floats of N·H·W pixels, attached.
 
-    Box-filtered linear radiance. `spp`: samples per pixel. `shadows`: do the photographs' own lights cast shadows? With
-    `edges`, gradients have the boundary terms of moving edges; without, only those of shading. `pixels`: a range
-    (first, last + 1) of pixels to render, numbered through all photographs; not together with `edges`.
+    They are box-filtered linear radiance. `spp`: samples per pixel. `shadows`: do the photographs' own lights cast
+    shadows? With `edges`, gradients contain the boundary terms of moving edges; otherwise only those of shading.
+    `pixels`: render only pixels from first to last, (first, last + 1), numbered through all photographs; not together
+    with `edges`.
     """
     ray, view = pixel_rays(photographs, spp, seed, pixels)
     lane = dr.arange(mi.UInt32, dr.width(ray)) + photographs.first_lane(spp, pixels[0] if pixels else 0)
@@ -33,10 +34,10 @@ def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, 
 
 
 def render_maps(scene, photographs, attributes, pixels=None):
-    """Render normals and mesh attributes at the centres of pixels, 0 where there is no surface or no such attribute.
+    """Render normals and mesh attributes at pixel centres; 0 where there is no surface or no such attribute.
 
-    `attributes`: numbers of channels by name. `pixels`: as in `render_photographs`. Returns Floats of N·H·W pixels,
-    [nx, ny, nz, first attribute, …]; normals are in world space.
+    `attributes`: number of channels by name. `pixels`: as in `render_photographs`. Returns [nx, ny, nz, first
+    attribute, …]: Floats of N·H·W pixels; normals are in world space.
     """
     si = scene.ray_intersect(center_rays(photographs, pixels)[0])
     maps = [dr.select(si.is_valid(), n, 0) for n in si.sh_frame.n]

@@ -93,6 +93,6 @@ def trace_paths(scene, si, view, photographs, bounces, random, table=None, known
 
 
 def separate_kernels(values) -> None:
-    """Compute values now, on a GPU: OptiX cannot trace rays through two scenes in one kernel."""
+    """On a GPU, evaluate `values` now: OptiX cannot trace rays through two scenes in one kernel."""
     if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
         dr.eval(values)

@@ -46,7 +46,7 @@ class MerlTable:
         self.texture = mi.Texture3f(tensor, wrap_mode=dr.WrapMode.Clamp)
 
     def value(self, theta, d):
-        """The BRDF f (3) [1/sr] for half vectors at `theta` [rad] from the normal and difference vectors `d`."""
+        """Evaluate the BRDF (3 channels) [1/sr]. `theta` [rad]: angle of the half vector; `d`: difference vector."""
         half = dr.sqrt(dr.clip(theta / (dr.pi / 2), 0, 1)) * CELLS[0]
         difference = dr.acos(dr.clip(d.z, 0, 1)) / (dr.pi / 2) * CELLS[1]
         turn = dr.atan2(d.y, d.x) / dr.pi
@@ -77,7 +77,7 @@ class MerlNetwork:
         self.layers = [arrays[name][names.index(material)].astype(float).tolist() for name in LAYERS]
 
     def value(self, theta, d):
-        """The BRDF, with arguments and result of `MerlTable.value`."""
+        """Evaluate the BRDF, with arguments and result of `MerlTable.value`."""
         theta = dr.minimum(theta, float(FITTED_ANGLES[0]))
         sin = dr.sqrt(dr.maximum(1 - d.z * d.z, 0))
         narrowed = dr.minimum(sin, float(np.sin(FITTED_ANGLES[1])))

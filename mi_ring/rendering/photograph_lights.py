@@ -17,7 +17,7 @@ DISTANT = 1e9  #: distance of a directional light [scene units]
 
 @dataclass(frozen=True)
 class Lights:
-    """The lights of N photographs as Dr.Jit buffers, which may be attached."""
+    """The light of each of N photographs, as Dr.Jit buffers that may be attached."""
 
     places: object  #: Float, 3 per light: position [scene units], or unit direction toward a distant light
     finite: object  #: Bool: is it a point light? Else it is distant
@@ -25,7 +25,10 @@ class Lights:
 
     @classmethod
     def of(cls, shots: Sequence[Shot]) -> "Lights":
-        """Collect the photographs' own lights. Raises SceneError if one is not finite, or if only some are black."""
+        """Collect the lights of photographs.
+
+        Raises SceneError if a light is not finite, or if some but not all are black.
+        """
         lights = [shot.own_light for shot in shots]
         finite = np.array([light.kind == "point" for light in lights])
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
@@ -45,16 +48,19 @@ class Lights:
 
     @classmethod
     def attached(cls, emitter) -> "Lights":
-        """Make one point light or distant light, attached to the parameters of its emitter."""
+        """Make the buffers of one point light or distant light, attached to the emitter's parameters."""
         place, finite = position_of(emitter)
         return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength_of(emitter))))
 
     def eye(self, k):
-        """Light `k`, one number per lane, as an eye: a point, or a direction toward a distant light; see `Edges`."""
+        """Return light `k`, one number per lane, as an eye; see `Edges`.
+
+        It is a position, or the direction toward a distant light.
+        """
         return dr.gather(mi.Vector3f, self.places, k), dr.gather(mi.Bool, self.finite, k)
 
     def sample(self, k, si):
-        """The light `k`, one per lane, at surface interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
+        """Sample light `k`, one number per lane, at surface interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
         where, finite = self.eye(k)
         strength = dr.gather(mi.Color3f, self.strengths, k)
         ds = dr.zeros(mi.DirectionSample3f)
@@ -73,7 +79,7 @@ class Lights:
         return Light("point", place, rgb) if self.is_finite()[k] else Light("directional", -place, rgb)
 
     def is_finite(self) -> np.ndarray:
-        """Which lights are point lights, (N,) bool; the others are distant."""
+        """Test which lights are point lights, (N,) bool. The others are distant."""
         return np.array(self.finite)
 
     def positions(self) -> np.ndarray:
@@ -85,7 +91,7 @@ class Lights:
         return np.array(self.strengths).reshape(-1, 3).astype(float)
 
     def toward(self, point: np.ndarray) -> np.ndarray:
-        """Vectors (N, 3) from a point (3,) to the lights [scene units], or unit directions toward distant lights."""
+        """Vectors (N, 3) from `point` (3,) to the lights [scene units]; unit directions for distant lights."""
         places = self.positions()
         return np.where(self.is_finite()[:, None], places - point, places)
 
@@ -94,13 +100,13 @@ class Lights:
         return np.where(self.is_finite(), np.linalg.norm(self.toward(point), axis=1), np.inf)
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """Irradiance (N, 3) by each light of a surface at a point (3,) that faces it: intensity / d² of equation 2."""
+        """Irradiance (N, 3) by each light at `point` (3,) on a surface that faces it: intensity / d² of equation 2."""
         distance2 = np.where(self.is_finite(), np.maximum((self.toward(point) ** 2).sum(1), 1e-24), 1.0)
         return self.rgb() / distance2[:, None]
 
 
 def flash_falloff(direction, to_world, falloff):
-    """The share of its intensity that a flash sends in a direction: the cosine from its axis to the power `falloff`.
+    """Angular falloff of a flash: cosine of the angle to its axis, to the power `falloff`.
 
     `direction`: unit vector from the surface to the flash. The axis is the optical axis of the camera with pose
     `to_world`.

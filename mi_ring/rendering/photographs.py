@@ -19,9 +19,9 @@ LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
 
 @dataclass(frozen=True)
 class Photographs:
-    """Cameras and lights of all photographs of a scene as Dr.Jit buffers, and which photographs to render.
+    """Cameras and lights of all photographs of a scene, as Dr.Jit buffers, and the selection to render.
 
-    In methods, a `view` is a number among the selected photographs, one per lane.
+    In methods, `view` (one number per lane) is an index into the selected photographs.
     """
 
     views: Views  #: buffers of all photographs
@@ -36,10 +36,10 @@ class Photographs:
 
     @classmethod
     def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None) -> "Photographs":
-        """Collect cameras and lights of photographs, which are all selected. `room` (BASIS, 3): light of their room.
+        """Collect cameras and lights of photographs; all are selected. `room` (BASIS, 3): room light.
 
-        `size` is that of the first photograph; `select` chooses photographs of equal size. Raises SceneError for lights
-        that cannot be rendered.
+        `size` becomes that of the first photograph; `select` chooses photographs of equal size. Raises SceneError for
+        unsupported lights.
         """
         lights = Lights.of(shots)
         views = Views.of(shots, lights.positions(), lights.rgb())
@@ -53,7 +53,7 @@ class Photographs:
 
     @classmethod
     def attached(cls, sensor) -> "Photographs":
-        """Make one photograph whose camera and light are attached to the parameters of its sensor."""
+        """Make the buffers of one photograph, attached to the parameters of the sensor and its light."""
         m = sensor.to_world.matrix
         light = Lights.attached(sensor.light)
         views = Views(
@@ -72,7 +72,7 @@ class Photographs:
         )
 
     def with_views(self, views: Views) -> "Photographs":
-        """Replace the buffers of cameras and lights. No light then counts as colocated with its camera."""
+        """Return the photographs with other cameras and lights. No light then counts as colocated with its camera."""
         return replace(self, views=views, colocated=False)
 
     @property
@@ -81,7 +81,7 @@ class Photographs:
         return Lights(self.views.places, self.finite, self.views.strengths)
 
     def in_units(self, unit: float) -> "Photographs":
-        """Convert to a world whose unit of length is `unit` scene units. The pictures stay the same."""
+        """Convert lengths to units of `unit` scene units. The pictures stay the same."""
         if unit == 1:
             return self
         views = self.views
@@ -104,15 +104,15 @@ class Photographs:
         return Pinhole(to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w), distortion)
 
     def eye(self, view):
-        """The camera position of each photograph `view` as an eye; see `Edges`."""
+        """The camera position of photograph `view` as an eye; see `Edges`."""
         return mi.Vector3f(self.camera(view).position), mi.Bool(True)
 
     def source(self, view):
-        """The light of each photograph `view` as an eye; see `Edges`."""
+        """The light of photograph `view` as an eye; see `Edges`."""
         return self.lights.eye(dr.gather(mi.UInt32, self.index, view))
 
     def light(self, view, si):
-        """The light of each photograph `view` at surface interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
+        """Sample the light of photograph `view` at surface interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
         k = dr.gather(mi.UInt32, self.index, view)
         ds, radiance = self.lights.sample(k, si)
         if self.views.falloff is not None:
@@ -123,22 +123,22 @@ class Photographs:
 
     @property
     def casts_shadows(self) -> bool:
-        """Can the photographs' own lights cast shadows that the cameras see?"""
+        """Test whether the photographs' own lights can cast shadows that the cameras see."""
         return not (self.colocated or self.dark)
 
     @property
     def harmonics(self) -> list[int]:
-        """The numbers of the room's harmonics that are not 0."""
+        """Indices of the room's spherical harmonics whose coefficients are not 0."""
         return [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
 
     def lighting(self, view):
-        """Make a function of surface interactions that is `light` of photograph `view`; None if `dark`."""
+        """Return the function si ↦ `light(view, si)`; None if the photographs have no lights of their own."""
         return None if self.dark else lambda si: self.light(view, si)
 
     def room_radiance(self, scene, view):
-        """Make a function of surface interactions: the room's light that they reflect as if nothing hid it, attached.
+        """Return a function of surface interactions: the room light that they reflect without occlusion, attached.
 
-        Returns None if there is no room. `view`: the photograph of each lane, because a room may turn with the camera.
+        None if there is no room light. `view`: photograph of each lane, because a room may turn with the camera.
         """
         which = self.harmonics
         if not which:
@@ -152,7 +152,10 @@ class Photographs:
         return radiance
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """Irradiance (N, 3) of a surface at a point (3,) that faces each light; if `dark`, by the mean of the room."""
+        """Irradiance (N, 3) at `point` (3,) on a surface that faces each light.
+
+        If the photographs have no lights of their own: the mean irradiance by room light.
+        """
         own = self.lights.irradiance(point)
         if self.dark and self.room is not None:
             own = own + math.pi * self.room[0] / math.sqrt(4 * math.pi)
@@ -160,35 +163,36 @@ class Photographs:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Number, height [px] and width [px] of the selected photographs."""
+        """(number, height [px], width [px]) of the selected photographs."""
         return len(self), self.size[1], self.size[0]
 
     @property
     def pixels(self) -> int:
-        """The number of pixels of all selected photographs together."""
+        """Total number of pixels of all selected photographs."""
         return math.prod(self.shape)
 
     def first_lane(self, spp: int, first: int = 0):
-        """The number of the first lane of selected photographs, or of their pixel `first`, with `spp` lanes each."""
+        """Index of the first lane of the selection, or of pixel `first` in it, with `spp` lanes per pixel."""
         return dr.opaque(mi.UInt32, (self.before * self.size[0] * self.size[1] + first) * spp % 2**32)
 
     def chunks(self, spp: int) -> Iterator[tuple[int, int]]:
-        """Split all pixels into ranges (first, last + 1) with at most `LANES` rays, if each pixel has `spp` rays."""
+        """Split all pixels into ranges (first, last + 1) of at most `LANES` rays, with `spp` rays per pixel."""
         step = max(1, LANES // spp)
         return ((first, min(first + step, self.pixels)) for first in range(0, self.pixels, step))
 
 
 def pixel_position(photographs: Photographs, pixel):
-    """The photograph, column and row of a `pixel` that is numbered through all selected photographs."""
+    """Return (photograph, column, row) of `pixel`, an index through all selected photographs."""
     width, height = photographs.size
     view, pixel = pixel // (width * height), pixel % (width * height)
     return view, mi.Float(pixel % width), mi.Float(pixel // width)
 
 
 def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int, int] | None = None):
-    """Make `spp` stratified camera rays per pixel: (rays, photograph per lane). A pixel's rays are consecutive lanes.
+    """Generate `spp` stratified camera rays per pixel. Returns (rays, photograph of each lane).
 
-    `pixels`: range (first, last + 1) of pixels; by default all. A pixel has the same rays in any range.
+    The rays of a pixel are consecutive lanes. `pixels`: range (first, last + 1); default: all. A pixel has the same
+    rays in any range.
     """
     first, last = pixels or (0, photographs.pixels)
     local = dr.arange(mi.UInt32, (last - first) * spp)
@@ -207,7 +211,10 @@ def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int,
 
 
 def center_rays(photographs: Photographs, pixels: tuple[int, int] | None = None):
-    """Make one ray through the centre of each pixel: (rays, photograph per lane). `pixels`: as in `pixel_rays`."""
+    """Generate one ray through each pixel centre. Returns (rays, photograph of each lane).
+
+    `pixels`: see `pixel_rays`.
+    """
     first, last = pixels or (0, photographs.pixels)
     pixel = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)
     view, column, row = pixel_position(photographs, pixel)

@@ -38,12 +38,15 @@ class Pinhole(NamedTuple):
         return self.position, dr.normalize(direction)
 
     def local(self, vector):
-        """Convert a direction of the world to the axes of the camera, by the inverse of 3 × 3 numbers of `to_world`."""
+        """Convert a direction from world to camera coordinates. It uses the inverse of the 3 × 3 part of `to_world`."""
         # Not by the transpose, though it is a rotation: the gradient with respect to each entry would be wrong.
         return dr.rcp(mi.Matrix3f([[self.to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
 
     def project(self, point):
-        """Project a point to (pixel coordinates [px], depth along the optical axis [scene units]); inverse of `ray`."""
+        """Project a point.
+
+        Returns (pixel coordinates [px], depth along the optical axis [scene units]); inverse of `ray`.
+        """
         x, y, z = self.local(point - self.position)
         x, y = x / z, y / z
         if self.distortion is not None:
@@ -54,7 +57,7 @@ class Pinhole(NamedTuple):
         return mi.Point2f(self.centre.x - self.focal.x * x, self.centre.y - self.focal.y * y), z
 
     def project_tangent(self, point, tangent):
-        """How far a point moves in the picture [px] if it moves by `tangent` in the world: derivative of `project`."""
+        """Derivative of `project`: how a point moves in the picture [px] if it moves by `tangent` in the world."""
         x, y, z = self.local(point - self.position)
         dx, dy, dz = self.local(tangent)
         moved = mi.Vector2f(dx * z - x * dz, dy * z - y * dz) / (z * z)

@@ -24,15 +24,14 @@ def render(
     surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
     seed: int = 0, shadows: bool = True, views: Views | None = None, lamps: Sequence[Tensor] = (),
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Render photographs of the surface as tensors, each under its own light, differentiable.
+    """Render photographs of the surface, each under its own light. Returns differentiable tensors.
 
-    `vertices` (V, 3) [scene units]; `attributes`: by name, (V, 3) or (V,), what the surface's BSDF reads of the mesh.
-    `photographs`: which to render and at what size; `spp` stratified samples per pixel; the same `seed` gives the same
-    samples. `shadows`: do the photographs' own lights cast shadows? `views`: other cameras and lights of all P
-    photographs, as tensors. `lamps`: other places and strengths (L, 3) of the scene's L lamps, as `Surface.relight`
-    takes them.
+    `vertices` (V, 3) [scene units]. `attributes`: by name, (V, 3) or (V,), the mesh attributes that the BSDF reads.
+    `photographs`: which to render, and at what size. `spp`: stratified samples per pixel. Equal `seed`, equal samples.
+    `shadows`: do the photographs' own lights cast shadows? `views`: other cameras and lights of all P photographs, as
+    tensors. `lamps`: other places and strengths, both (L, 3), of the scene's L lamps, see `Surface.relight`.
 
-    Returns linear radiance (N, H, W, 3) and coverage (N, H, W) in [0, 1]. Gradients with respect to all tensors are
+    Returns (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). Gradients with respect to all tensors are
     those of shading, of outlines and of edges of cast shadows, for radiance and for coverage. There can be one backward
     pass, before the surface is written again; else it raises RuntimeError. Raises ValueError like `Surface.parameters`.
     """
@@ -59,9 +58,9 @@ def render(
 
 
 def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Tensor:
-    """Set the gradient (V, 3) of vertices (V, 3) to 0 where it is not finite because a triangle (F, 3) has no area.
+    """Set the gradient (V, 3) to 0 at vertices (V, 3) where a triangle without area makes it infinite or NaN.
 
-    Mitsuba's vertex normals have gradients there that are not finite. Other entries that are not finite stay.
+    The cause are Mitsuba's vertex normals. Other infinite or NaN entries stay. `faces`: (F, 3).
     """
     if gradient.isfinite().all():
         return gradient
@@ -76,7 +75,7 @@ def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Te
 
 
 def with_views(photographs: Photographs, views: Views) -> Photographs:
-    """Give photographs other cameras and lights, which are tensors, without gradients."""
+    """Return photographs with other cameras and lights, given as tensors, without gradients."""
     return photographs.with_views(Views(*map(to_drjit, views)))
 
 

@@ -22,17 +22,17 @@ FRAMES = {"world": [*range(PER_FRAME)], "camera": [0, *range(PER_FRAME, BASIS)]}
 
 
 def harmonics_up_to(order: int, frames: Iterable[str]) -> list[int]:
-    """The numbers of the harmonics up to an `order`, in the axes `frames` ("world", "camera")."""
+    """Indices of the harmonics up to degree `order`, in the coordinate frames `frames` ("world", "camera")."""
     return sorted({k for frame in frames for k in FRAMES[frame][: (order + 1) ** 2]})
 
 
 def degree(k: int) -> int:
-    """The degree l of harmonic `k`."""
+    """Degree l of the harmonic with index `k`."""
     return int((k if k < PER_FRAME else k - PER_FRAME + 1) ** 0.5)
 
 
 def room_of(scene) -> np.ndarray | None:
-    """Sum the `room` emitters of a scene to a room (BASIS, 3); None if there are none."""
+    """Sum the `room` emitters of a scene: harmonics (BASIS, 3). None if there are none."""
     rooms = [emitter for emitter in scene.emitters() if is_room(emitter)]
     total = np.zeros((BASIS, 3))
     for room in rooms:
@@ -42,9 +42,9 @@ def room_of(scene) -> np.ndarray | None:
 
 
 def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
-    """Take the `envmap` and `constant` emitters out of a scene. Returns the scene and a room (BASIS, 3) of their light.
+    """Remove the `envmap` and `constant` emitters. Returns (new scene, harmonics (BASIS, 3) of their light).
 
-    The same scene and None if there are none.
+    Without such emitters: (the same scene, None).
     """
     found = [lamp for lamp in shared_emitters(scene) if lamp.is_environment()]
     if not found:
@@ -54,7 +54,7 @@ def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
 
 
 def harmonics_of(environment) -> np.ndarray:
-    """Convert an emitter that is infinitely far away to a room (BASIS, 3)."""
+    """Project the light of an infinitely distant emitter to spherical harmonics (BASIS, 3)."""
     directions, angles = envmap_directions(FINE_ROWS)
     toward, si = mi.Vector3f(*directions.T), dr.zeros(mi.SurfaceInteraction3f, len(angles))
     si.wi = -toward
@@ -65,16 +65,16 @@ def harmonics_of(environment) -> np.ndarray:
 
 
 def world_harmonics(directions: np.ndarray, order: int = MAX_ORDER) -> np.ndarray:
-    """Evaluate the world's harmonics up to an `order` in unit directions (n, 3): ((order + 1)², n)."""
+    """Evaluate spherical harmonics up to degree `order` in unit directions (n, 3): ((order + 1)², n)."""
     values = dr.sh_eval(mi.Vector3f(*directions.T.astype(np.float32)), order)
     return np.stack([np.asarray(value + dr.zeros(mi.Float, len(directions))) for value in values])
 
 
 def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions and solid angles of the pixels of an environment map with `rows` rows and 2 rows columns.
+    """Pixels of an environment map of `rows` × 2 `rows`.
 
-    Returns (2 rows², 3) and (2 rows²,). In latitude and longitude like Mitsuba's `envmap`: y is up, and -z is in the
-    middle of the left and right borders.
+    Returns (unit directions (2 rows², 3), solid angles (2 rows²,)). Latitude and longitude are as in Mitsuba's
+    `envmap`: y is up, and -z is at the left and right borders.
     """
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
     theta, phi = np.pi * v.ravel(), 2 * np.pi * u.ravel()
@@ -83,12 +83,12 @@ def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def frames_of(scene) -> set[str]:
-    """The axes of a scene's `room` emitters, "world" or "camera"; "world" if there are none."""
+    """Coordinate frames of a scene's `room` emitters, "world" or "camera"; {"world"} if there are none."""
     return {emitter.frame for emitter in scene.emitters() if is_room(emitter)} or {"world"}
 
 
 def evaluated_harmonics(direction, to_world, which: Sequence[int]) -> list:
-    """Evaluate the harmonics `which` in a direction of the world, for a camera with pose `to_world`."""
+    """Evaluate the harmonics with indices `which` in a world direction, for a camera with pose `to_world`."""
     order = max(map(degree, which))
     world = dr.sh_eval(direction, order) if min(which) < PER_FRAME else []
     camera = dr.sh_eval(to_camera_axes(direction, to_world), order) if max(which) >= PER_FRAME else []
@@ -96,22 +96,22 @@ def evaluated_harmonics(direction, to_world, which: Sequence[int]) -> list:
 
 
 def to_camera_axes(direction, to_world):
-    """Convert a direction of the world to the axes of a camera with pose `to_world`."""
+    """Convert a direction from world to camera coordinates; `to_world`: pose of the camera."""
     return mi.Vector3f(*(dr.dot(mi.Vector3f(*(to_world[j, i] for j in range(3))), direction) for i in range(3)))
 
 
 def bsdfs_with_lobes(scene) -> list:
-    """The BSDFs of a scene that have a method `lobes`; each BSDF once."""
+    """List the BSDFs of a scene that have a method `lobes`, each once."""
     found = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in scene.shapes()) if hasattr(bsdf, "lobes")}
     return list(found.values())
 
 
 def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], active=True) -> list:
-    """Radiance that surface interactions `si` reflect of each of the harmonics `which` without occlusion.
+    """Radiance, one Color3f each, that `si` reflects when the light is each harmonic in `which`, without occlusion.
 
-    Color3f each, attached. By the `lobes` of the BSDFs: a lobe multiplies each degree of the harmonics about its
-    direction by a factor, as in "A Signal-Processing Framework for Inverse Rendering" (Ramamoorthi and Hanrahan 2001).
-    Other BSDFs reflect nothing.
+    It is attached. A lobe multiplies each degree of the harmonics about its direction by a factor, as in "A
+    Signal-Processing Framework for Inverse Rendering" (Ramamoorthi and Hanrahan 2001). BSDFs not in `bsdfs` reflect
+    nothing.
     """
     total = [mi.Color3f(0) for _ in which]
     for bsdf in bsdfs:
@@ -123,10 +123,10 @@ def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], a
 
 
 def room_envmap(room: np.ndarray, to_world: np.ndarray, rows: int = ENVMAP_ROWS) -> np.ndarray:
-    """Convert a room (BASIS, 3) to an environment map (rows, 2 rows, 3) like Mitsuba's `envmap`.
+    """Convert room light (BASIS, 3) to an environment map (rows, 2 rows, 3) like Mitsuba's `envmap`.
 
-    `to_world`: pose of the camera, with which a part of the room may turn. Radiance may be negative: a sum of few
-    harmonics can be.
+    `to_world`: pose of the camera, with which a part of the room may turn. Radiance may be negative, because few
+    harmonics are used.
     """
     directions, _ = envmap_directions(rows)
     which, values = np.flatnonzero(room.any(1)).tolist() or [0], np.zeros((len(directions), 3))

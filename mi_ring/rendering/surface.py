@@ -55,11 +55,11 @@ class Surface:
             self.faces, self.faces_changed = faces, True
 
     def parameters(self, vertices: Tensor, attributes: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Name tensors as the mesh's parameters: vertices (V, 3) [scene units] and attributes (V, 3) or (V,).
+        """Convert tensors to the mesh's parameters by name: vertices (V, 3) [scene units], attributes (V, 3) or (V,).
 
         The vertices come first in the result, in units of `unit`.
 
-        Raises ValueError if the number of vertices is not that of the triangles, or an attribute has another size.
+        Raises ValueError if the triangles need another number of vertices, or if an attribute has another size.
         """
         needed = int(self.faces.max()) + 1
         if vertices.shape != (needed, 3):
@@ -93,10 +93,10 @@ class Surface:
         self.written += 1
 
     def relight(self, places: mi.Float, strengths: mi.Float) -> None:
-        """Change the scene's L lamps by Floats with three numbers per lamp. The given scene stays as it was.
+        """Change the scene's L lamps in this surface's scene; the original scene stays unchanged.
 
-        `places`: positions [scene units], or unit directions toward distant lamps. `strengths`: intensities [W/sr], or
-        irradiances [W/m²] of distant lamps. Both may be attached.
+        `places` (3 L numbers): positions [scene units], or unit directions toward distant lamps. `strengths` (3 L
+        numbers): intensities [W/sr], or irradiances [W/m²] of distant lamps. Both may be attached.
         """
         if not self.owns_lamps:
             self.scene, self.owns_lamps = with_lamps(self.scene, lamp_lights(self.scene)), True
@@ -104,7 +104,10 @@ class Surface:
         move_lamps(self.scene, places, strengths)
 
     def show(self, ring: RenderedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
-        """Write the surface of `ring` at domain points `s` (V, 3) with triangles (F, 3), at a `time` in [0, 1]."""
+        """Evaluate `ring` at domain points `s` (V, 3) and write the surface with triangles `faces` (F, 3).
+
+        `time`: of the flow, in [0, 1].
+        """
         with torch.no_grad():
             self.set_faces(faces)
             self.write(*ring(s.to(ring.center.device), time))

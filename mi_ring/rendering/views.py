@@ -11,7 +11,7 @@ from mi_ring.scene.shot import Shot
 
 
 class Views(NamedTuple):
-    """Cameras and lights of P photographs, as arrays of numpy or torch, or as Dr.Jit buffers, which are flat."""
+    """Cameras and lights of P photographs, as numpy arrays, torch tensors or flat Dr.Jit buffers."""
 
     cameras: Any  #: (P, 3, 4) camera-to-world
     intrinsics: Any  #: (P, 4) fx, fy, cx, cy [px]
@@ -22,7 +22,7 @@ class Views(NamedTuple):
 
     @classmethod
     def of(cls, shots: Sequence[Shot], places: np.ndarray, strengths: np.ndarray) -> "Views":
-        """Collect the cameras of photographs, with lights `places` (P, 3) and `strengths` (P, 3), as numpy arrays."""
+        """Collect the cameras of photographs as numpy arrays. `places` (P, 3), `strengths` (P, 3): their lights."""
         cameras = [shot.camera for shot in shots]
         return cls(
             np.stack([camera.to_world[:3] for camera in cameras]),
@@ -40,7 +40,7 @@ class Views(NamedTuple):
         return Views(**buffers | {name: None for name in ("falloff", "distortion") if not getattr(self, name).any()})
 
     def camera(self, k: int, size: tuple[int, int]) -> Camera:
-        """The camera of photograph `k`, `size` (width, height) [px]. For numpy arrays only."""
+        """Return the camera of photograph `k`. `size`: (width, height) [px]. For numpy arrays only."""
         lens = self.intrinsics[k]
         pose = np.vstack([self.cameras[k], [0, 0, 0, 1]])
         return Camera(pose, lens[:2], lens[2:], size, float(self.distortion[k]))
