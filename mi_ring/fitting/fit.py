@@ -126,11 +126,7 @@ class Fit(Renamed):
         return it
 
     def evaluate(self, batch: Batch, observation: Observation) -> tuple[Tensor, Iteration]:
-        """Compute the loss of a batch with the current model.
-
-        Returns the loss, with its autograd graph, and the iteration. Changes no state, so an optimiser may call it
-        several times in one step.
-        """
+        """The loss of a batch, with its autograd graph, and the iteration. Changes no state: a step may repeat it."""
         it = Iteration(batch, observation, self.renderer.predict(self.problem, self.model, batch), self.context())
         return self.loss(it), it
 
@@ -186,10 +182,7 @@ class Fit(Renamed):
         results.save(Path(folder), self.result())
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the fit, to be saved by `torch.save`.
-
-        `restore` continues from it in a `Fit` of the same capture.
-        """
+        """The state of the fit, for `torch.save`. `restore` of a `Fit` of the same capture continues from it."""
         return copy.deepcopy({  # the next iteration changes it
             "ring": ring_state(self.ring, self.problem.config.settings()), "lighting": tuple(self.problem.lighting),
             "calibration": self.model.calibration and self.model.calibration.state_dict(),
