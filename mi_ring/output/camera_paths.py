@@ -49,10 +49,10 @@ class RenderConfig(MaterialOptions):
     turntable: int = 0
     """Number of pictures of a film: camera and light move once around the object. For example 120. 0: no such film."""
     light_orbit: int = 0
-    """Number of pictures of a film: the light moves once around the line from the object to the camera, which stands still.
+    """Number of pictures of a film: the camera stands still, the light moves in a circle around the line of sight.
     Seen from the object, the angle between light and camera is always 45 degrees. For example 120. 0: no such film."""
     flow: int = 0
-    """Number of pictures of a film: the start surface of the fit deforms into the object. For example 60. 0: no such film."""
+    """Number of pictures of a film: the fit's start surface deforms into the object. For example 60. 0: no such film."""
     view: str | None = None
     """File name of the photograph whose camera and light --turntable, --light-orbit and --flow use.
     Without it: the first photograph."""
@@ -63,7 +63,7 @@ class RenderConfig(MaterialOptions):
     """Direction that points up in the scene, for example 0 0 1: the axis of --turntable and the top of --envmap.
     Without it: the mean up direction of the cameras."""
     envmap: Path | None = None
-    """EXR or HDR file of an environment map (latitude, longitude) that lights the object in place of the scene's lights."""
+    """EXR or HDR file of an environment map (latitude, longitude). It replaces the scene's lights."""
     integrator: str | None = None
     """Name of the Mitsuba integrator that computes the light. Without it: photometric, or path with --envmap.
     photometric is fast and predicts photographs as the fit does. It cannot be used with --envmap.

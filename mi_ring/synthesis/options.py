@@ -36,7 +36,7 @@ class SynthesizeConfig:
     """Material of the object, for example "principled base_color=0.6,0.2,0.1 roughness=0.3". All forms: see above.
     Without it: principled, with the colours of the mesh file, or with one colour if the file has none."""
     second: str | None = None
-    """Second material, in one of the forms above. --pattern says where it is. Without it: the object has one material."""
+    """Second material, in one of the forms above; --pattern says where it is. Without it: a single material."""
     pattern: Annotated[str, arg(metavar="stripes|checks|PICTURE")] = "stripes"
     """Where on the object the second material is.
     stripes: in stripes across the object. checks: in a checkerboard.
@@ -82,7 +82,7 @@ class SynthesizeConfig:
     """Position of the flash relative to the lens: left, up and forward [distance from the camera to the object].
     0.1 0.2 0: to the left by a tenth of this distance and up by a fifth."""
     spread: float = 40.0
-    """Largest angle between camera and light, seen from the object [deg], 0 to 80. For --light point and distant only."""
+    """Largest angle between camera and light, seen from the object [deg], 0 to 80; for --light point and distant."""
     room: float = 0.0
     """Strength of additional light from all sides, as in a room that is not dark, 0 to 10. 0: none.
     1: on a surface that faces --light, both are equally strong. Give 0.05 to 0.2 to test fits of such photographs."""
@@ -93,7 +93,7 @@ class SynthesizeConfig:
     """Render each view a second time, under the light of --room alone.
     The scene file names these second photographs (`ambient`), and a fit subtracts them."""
     environment: Path | None = None
-    """EXR or HDR file of an environment map (latitude, longitude) that lights the object instead of --light and --room."""
+    """EXR or HDR file of an environment map (latitude, longitude). It replaces the lights of --light and --room."""
     table: Literal["none", "plain", "sheet"] = "none"
     """Table below the object, which hides its underside from cameras and reflects light.
     none: no table. plain: a plain table. sheet: a table with the sheet of mi-ring board; --radius is in millimetres."""
