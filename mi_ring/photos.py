@@ -75,7 +75,7 @@ class PhotosConfig:
     A folder: the masks in it. The mask of photo.jpg is photo.jpg.png, photo.png or photo.jpg."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box around the object [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH, for example -40 40 -40 40 0 120.
-    The origin is the middle of the sheet: x right, y up on the sheet, z out of the paper.
+    The origin is the middle of the sheet. x points to its right edge, y to its top edge, z out of the paper.
     Give it if the masks contain another thing, because it touches the object in the photographs."""
     square_mm: float = SQUARE
     """Side of a square of the printed sheet [mm].

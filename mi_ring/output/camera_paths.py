@@ -52,7 +52,7 @@ class RenderConfig(MaterialOptions):
     """Number of pictures of a film: the camera stands still, the light moves in a circle around the line of sight.
     Seen from the object, the angle between light and camera is always 45 degrees. For example 120. 0: no such film."""
     flow: int = 0
-    """Number of pictures of a film: the fit's start surface deforms into the object. For example 60. 0: no such film."""
+    """Number of pictures of a film: the start surface deforms into the object. For example 60. 0: no such film."""
     view: str | None = None
     """File name of the photograph whose camera and light --turntable, --light-orbit and --flow use.
     Without it: the first photograph."""
