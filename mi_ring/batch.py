@@ -50,8 +50,8 @@ class BatchConfig:
     """Memory that one fit needs [GiB], for example 4. 0: no limit.
     A machine then runs only as many fits at a time as its memory allows."""
     retries: int = 3
-    """How many times in a row a fit may stop without progress before it counts as failed.
-    A restarted fit continues from its checkpoint. Raise the number where fits are often stopped from outside."""
+    """How many times in a row a fit that died is restarted without progress in between, 0 or more. Then it has failed.
+    A restarted fit continues from its checkpoint. Raise the number if other programs often stop the fits."""
     address: str | None = None
     """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without it: this machine alone."""
 

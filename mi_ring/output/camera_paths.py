@@ -63,11 +63,12 @@ class RenderConfig(MaterialOptions):
     """Direction that points up in the scene, for example 0 0 1: the axis of --turntable and the top of --envmap.
     Without it: the mean up direction of the cameras."""
     envmap: Path | None = None
-    """EXR or HDR file of an environment map (latitude, longitude). It replaces the scene's lights."""
+    """EXR or HDR file of an environment map (latitude, longitude). It replaces the lights of the photographs.
+    Lamps of the scene file stay on. A `table` shape is left out."""
     integrator: str | None = None
     """Name of the Mitsuba integrator that computes the light. Without it: photometric, or path with --envmap.
     photometric is fast and predicts photographs as the fit does. It cannot be used with --envmap.
-    path traces all reflections, also in scenes with other objects. It has more noise and does not show a `table`."""
+    path traces all reflections, also in scenes with other objects. It has more noise and leaves out a `table`."""
     format: Literal["png", "exr"] | None = None
     """Format of the pictures. png: 8-bit sRGB. exr: linear radiance.
     Without it: that of the file names in the scene; png for --turntable, --light-orbit and --flow."""
