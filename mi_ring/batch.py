@@ -34,22 +34,24 @@ class BatchConfig:
     """
 
     scenes: Positional[Annotated[tuple[Path, ...], arg(metavar="SCENE.xml")]]
-    """Mitsuba XML files, each with the photographs of one object."""
+    """Mitsuba XML files. Each names the photographs of one object, for example captures/*/scene.xml."""
     out: Path = Path("out")
     """Folder for all results. Each scene gets a folder of its name, and index.html shows all results.
-    batch/ keeps what each fit has printed. On a cluster, scenes and this folder have the same path on all machines."""
+    Its folder batch has the printed output of each fit.
+    On a cluster, the scenes and this folder must have the same path on all machines."""
     workers: int = 1
-    """Number of fits that run at the same time. More use the cores better, but each fit needs its own memory."""
+    """Number of fits that run at the same time, for example 2. More fits use the cores better, but need more memory."""
     cpus: int = 0
-    """Processor cores for each fit. 0: an equal share of this machine's cores for each of the --workers."""
+    """Processor cores for each fit. 0: this machine's cores divided by --workers."""
     gpus: float = 0
-    """GPUs for each fit. 0.5 lets two fits share a GPU. 0: the fits use processors only.
+    """GPUs for each fit. 1: a GPU for each fit. 0.5: two fits share a GPU. 0: the fits use processors only.
     With GPUs, also give --variant cuda_ad_rgb after --, among the options of the fits."""
     memory: float = 0
-    """Memory that one fit needs [GiB]. A machine runs only as many fits at a time as its memory allows. 0: no limit."""
+    """Memory that one fit needs [GiB], for example 4. 0: no limit.
+    A machine then runs only as many fits at a time as its memory allows."""
     retries: int = 3
-    """How many times in a row a fit may stop without progress before it counts as failed.
-    A restarted fit continues from its checkpoint. Raise the number where fits are often stopped from outside."""
+    """How many times in a row a fit that died is restarted without progress in between, 0 or more. Then it has failed.
+    A restarted fit continues from its checkpoint. Raise the number if other programs often stop the fits."""
     address: str | None = None
     """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without it: this machine alone."""
 

@@ -21,7 +21,7 @@ class BoardConfig:
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """File to write: .pdf to print, or .png."""
     paper: Literal["a4", "letter"] = "a4"
-    """Size of the paper in the printer."""
+    """Size of the paper in the printer. a4: 210 × 297 mm. letter: 8.5 × 11 inches, as in North America."""
 
 
 def main(arguments: Sequence[str]) -> None:

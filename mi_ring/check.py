@@ -29,12 +29,12 @@ class CheckConfig:
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file that names the photographs, their cameras and lights."""
     out: Path | None = None
-    """Contact sheet to write, a .png file with all photographs and masks. Without it: out/check/NAME.png."""
+    """Contact sheet to write, a .png file with all photographs and masks. Without it: out/check/NAME.png.
+    NAME is the scene file without .xml. For a file pot/scene.xml the folder gives the name."""
     masks: Literal["auto", "given", "none"] = "auto"
-    """Which masks to check.
-    given: the masks of the scene file. auto: the same; if there are none and the room was dark, masks by brightness.
-    none: masks by brightness in a dark room. The masks of the scene file are ignored.
-    Set none if the masks of the scene file are wrong and the background is dark."""
+    """The masks to check. Set none if the masks of the scene file are wrong and the background is dark.
+    given: the masks of the scene file. none: they are ignored; in a dark room the bright pixels are the mask.
+    auto: given if the scene file has masks, otherwise none."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -34,15 +34,17 @@ class EvaluateConfig:
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit."""
     mesh: Path
-    """File of the true surface, in the units and the frame of the scene: PLY, OBJ or GLB."""
+    """PLY, OBJ or GLB file of the true surface, in the units and the frame of the scene.
+    For a capture of mi-ring synthesize or mi-ring example it is truth/mesh.ply."""
     novel: Path | None = None
-    """Scene file of photographs that the fit has not seen, to compare predictions with. Without it: none."""
+    """Scene file of photographs that the fit has not used. Predictions of these photographs are compared with them.
+    Without it: only the photographs of the fit are compared."""
     seen: bool = False
-    """Compute Chamfer distance and F-score only of parts that a photograph of the fit shows.
+    """Compute Chamfer distance and F-score only for parts of the surfaces that a photograph of the fit shows.
     Use it if the photographs do not show the whole object, for example not its underside."""
     align: Literal["rigid", "similarity"] | None = None
     """Align the true surface and the photographs of --novel with the fit before the comparison.
-    rigid: by rotation and translation. similarity: also by scale. Numbers of the fit's own photographs do not change.
+    rigid: by rotation and translation. similarity: also by scale. Results for the fit's own photographs do not change.
     Use it after a fit with --refine cameras, in which the whole object may move."""
     spp: int = SPP
     """Samples per pixel of the predicted photographs. More samples give less noise and take longer."""

@@ -44,10 +44,11 @@ class ExportConfig(MaterialOptions):
     """Width and height of the textures [texels], 64 to 4096. More texels keep finer detail and make larger files.
     A .ply has no textures."""
     time: float = 1.0
-    """Which surface to write, as a time of the deformation: 0 is where the fit started, 1 is the finished object."""
+    """Which state of the deformation to write, 0 to 1. 0: the start surface of the fit. 1: the finished object.
+    0.5: the surface after half of the deformation."""
     metres: float | None = None
-    """Length of a scene unit [m]; only for .glb. Without it: the length that the capture gives.
-    Set it to give the object its real size. Captures of mi-ring photos with the printed sheet know their unit."""
+    """Length of a scene unit [m], to give the object its real size. 0.001: the unit is the millimetre. Only for .glb.
+    Without it: the length that the capture gives. Captures of mi-ring photos with the printed sheet give it."""
 
 
 def require_options(config: ExportConfig) -> None:

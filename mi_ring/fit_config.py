@@ -29,7 +29,7 @@ class Task:
     """Mitsuba XML file that names the photographs, their cameras and lights."""
     out: Path | None = None
     """Folder for the results. Without it: out/NAME.
-    NAME is the name of the scene file, or of its folder if the file is called scene.xml."""
+    NAME is the scene file without .xml: pot.xml gives out/pot. For a file pot/scene.xml the folder gives the name."""
     resume: bool = False
     """Continue an interrupted fit from the checkpoint in its results folder. Give the same options as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
@@ -37,12 +37,12 @@ class Task:
     fast: a preview in one minute. default: good results in five minutes. fine: more detail in half an hour.
     paper: the paper's own settings, seven hours."""
     minutes: float = 0
-    """Time for the whole command, approximately [min]. 0: no limit.
-    The command measures the speed of this machine and chooses --iterations, and --preset if you do not give one."""
+    """Time that the whole command may take, approximately [min], for example 10. 0: no limit.
+    The command measures the speed of this machine and sets --iterations. If you give no --preset, it sets that, too."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba. llvm_ad_rgb: on the processor. cuda_ad_rgb: on a GPU of Nvidia, if there is one."""
+    """Where Mitsuba computes. llvm_ad_rgb: on the processor. cuda_ad_rgb: on an Nvidia GPU, which must be there."""
     threads: int = 0
-    """Number of processor threads. 0: all. Give fewer to leave cores to other programs."""
+    """Number of processor threads. 0: one per core. Give for example 2 to leave the other cores to other programs."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,8 +43,9 @@ class PaperConfig:
     table2 takes the folder of DiLiGenT-MV, single takes .npz files.
     Without data, the other experiments use the pot2 of a checkout or the pot of mi-ring example."""
     materials: tuple[str, ...] = ()
-    """Materials of the meshes, in the form that mi-ring synthesize takes.
-    The meshes get the materials in turn. specularity puts all of them on its one mesh, stripes needs two."""
+    """Materials of the meshes, for example "principled roughness=0.3"; mi-ring synthesize --help lists all forms.
+    The first mesh gets the first material, the second the second, and so on; then again from the first.
+    specularity puts each material on its one mesh, stripes needs two."""
     out: Path = Path("out/paper")
     """Folder for the results of all experiments and for the captures that they make.
     Each experiment has a folder of its name and preset."""
@@ -52,17 +53,18 @@ class PaperConfig:
     """Preset of the fits, as in mi-ring fit: finer presets take longer.
     Without it: default, or fast with --quick, which allows no other."""
     seeds: tuple[int, ...] = (0,)
-    """Random seeds. Each run is made once with each seed, and the table has the means. More seeds give surer means."""
+    """Random seeds, for example 0 1 2. Each run is made once with each seed, and the table has the means.
+    More seeds give surer means and take longer."""
     only: tuple[str, ...] = ()
-    """Names of the runs to make now, to spread an experiment over several times or machines.
-    A wrong name makes the command list all names. Without it: all runs."""
+    """Names of the runs to make now. The others can be made later or on other machines.
+    To see all names, give a wrong one. Without it: all runs."""
     quick: bool = False
     """Make a small version in minutes: few runs, few iterations, small photographs.
     Its results are in OUT/NAME-quick."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Variant of Mitsuba. llvm_ad_rgb: on the processor. cuda_ad_rgb: on a GPU of Nvidia, if there is one."""
+    """Where Mitsuba computes. llvm_ad_rgb: on the processor. cuda_ad_rgb: on an Nvidia GPU, which must be there."""
     threads: int = 0
-    """Number of processor threads of each fit. 0: all. Give fewer to leave cores to other programs."""
+    """Number of processor threads. 0: one per core. Give for example 2 to leave the other cores to other programs."""
 
 
 def main(arguments: Sequence[str]) -> int:

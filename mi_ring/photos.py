@@ -62,24 +62,24 @@ class PhotosConfig:
     """Folder to write: scene.xml, its files, and work/ with intermediate results.
     If the command is interrupted, it continues from work/."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of the flash relative to the lens: right, down and forward.
-    With a sheet the unit is mm, and the sheet refines the position.
-    Without a sheet the unit is the median distance from the cameras to the object.
-    Measure it while the camera is held as in most photographs. For the others the command turns it with the camera."""
+    """Position of the flash relative to the lens: right, down, forward. 30 -60 0: 30 to the right and 60 above it [mm].
+    The command refines it by the printed sheet. Without a sheet the unit is the median distance from camera to object.
+    Measure while you hold the camera as in most photographs. For the others the command turns it with the camera."""
     turntable: bool = False
     """Set it if the object turned on a turntable while camera and flash stood still.
-    It needs the printed sheet of `mi-ring board` under the object, turning with it."""
+    The printed sheet of `mi-ring board` must lie under the object and turn with it."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
     """Where the masks of the object come from. Give another source if the masks of auto are wrong.
     auto: found from the photographs and their 3-D points. alpha: the alpha channels of the photographs.
-    rembg: the package rembg, which must be installed.
-    A folder: photo.jpg has the mask photo.jpg.png, photo.png or photo.jpg."""
+    rembg: found by the package rembg, which must be installed.
+    A folder: the masks in it. The mask of photo.jpg is photo.jpg.png, photo.png or photo.jpg."""
     box: tuple[float, float, float, float, float, float] | None = None
-    """Box around the object in the frame of the sheet [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH.
-    Give it if the masks contain another thing, one that touches the object in the photographs."""
+    """Box around the object [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH, for example -40 40 -40 40 0 120.
+    The origin is the middle of the sheet. x points to its right edge, y to its top edge, z out of the paper.
+    Give it if the masks contain another thing, because it touches the object in the photographs."""
     square_mm: float = SQUARE
     """Side of a square of the printed sheet [mm].
-    Give it if the printer does not print at 100 %: measure several squares with a ruler."""
+    Give it if the printer did not print at 100 %: if five squares together measure 99 mm, give 19.8."""
 
     def __post_init__(self) -> None:
         if not 0 < self.square_mm < np.inf:

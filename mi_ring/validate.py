@@ -37,9 +37,10 @@ class ValidateConfig:
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml|RUN")]]
     """Mitsuba XML file that names the photographs, or results folder of a fit."""
     out: Path | None = None
-    """Folder for the results. Without it: RUN/validate, or out/validate/NAME for a scene file."""
+    """Folder for the results. Without it: RUN/validate, or out/validate/NAME for a scene file.
+    NAME is the scene file without .xml. For a file pot/scene.xml the folder gives the name."""
     photographs: tuple[str, ...] = ()
-    """Ids or image names of the photographs that are rendered and compared. Without it: all."""
+    """Photographs to compare, by id or image name in the scene file, for example 003.jpg. Without it: all."""
     width: int = 128
     """Largest width and height of the pictures [px]. Larger pictures take longer and show smaller details."""
     spp: int = 64
@@ -48,7 +49,8 @@ class ValidateConfig:
     """Largest length of the path tracer's light paths, Mitsuba's max_depth: 3 or more. -1: no limit.
     Longer paths find more interreflection and take longer. With 2 there would be direct light only."""
     significance: float = 0.01
-    """Probability of a false alarm, above 0 and below 1: a reported difference although both renderers agree."""
+    """Probability that the command reports a difference by chance although both renderers agree, above 0 and below 1.
+    0.01: once in a hundred runs. A smaller number misses more small differences."""
     seed: int = 0
     """Random seed of all samples. Another seed shows whether a reported difference is chance."""
 

@@ -47,7 +47,7 @@ class Common:
     refine: tuple[Unknown, ...] = ("auto",)
     """Calibration that the fit corrects, in addition to surface and material. It starts from the scene file.
     auto: light, power and ambient, and scale if it is needed. If the light is unknown: gain and ambient.
-    none: nothing. Set it if the calibration is exact. If predicted photographs look shifted, set auto cameras focal.
+    none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto cameras focal.
     cameras: position and direction of each camera.
     focal, principal: focal length and principal point of each lens.
     distortion: first radial distortion coefficient of each lens.
@@ -63,9 +63,8 @@ class Common:
     masks: outlines of the object. The fit finds them again after a half and after three quarters of its iterations."""
     masks: Literal["auto", "given", "none"] = "auto"
     """The masks that the fit uses. Set none if the masks of the scene file are wrong and the background is dark.
-    given: the masks of the scene file. auto: the same; if there are none and the room was dark, masks by brightness.
-    none: masks by brightness in a dark room. The masks of the scene file are ignored.
-    --weights.mask 0 fits without any mask."""
+    given: the masks of the scene file. none: the fit ignores them; in a dark room the bright pixels are the mask.
+    auto: given if the scene file has masks, otherwise none. To fit without any mask, set --weights.mask 0."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
     """The start surface that the fit deforms. The result has the same number of handles (genus).
     hull: the visual hull of the masks. mesh FILE: a closed mesh in scene units. sphere: a sphere around the object.
@@ -73,18 +72,19 @@ class Common:
     A start near the object saves time. Give a mesh if the masks do not show a handle of the object."""
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameters of the BSDF that the fit finds, each with its lowest and highest value (inf: no limit).
-    Set it if the BSDF of the scene is not cooktorrance, for example: base_color 0 1 roughness 0.05 1"""
+    Set it if the BSDF of the scene is not cooktorrance: --parameters base_color 0 1 roughness 0.05 1"""
     holdout: int = 0
     """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.
-    For example, 8 leaves out the fifth, the thirteenth, and so on. The test needs photographs that the fit then lacks.
-    Calibration that all photographs share is reset if its correction by --refine does not improve this test."""
+    For example, 8 leaves out the fifth, the thirteenth, and so on. The fit then has fewer photographs.
+    If a correction by --refine that all photographs share does not improve this test, the fit undoes it."""
     iterations: int = 460
-    """Number of iterations, all stages together. More iterations take longer and give finer detail.
+    """Number of iterations of all stages together, for example 1400. More take longer and give finer detail.
     A fit from a hull or a mesh makes fewer iterations, a fit under an unknown environment 15 % more."""
     seed: int = 0
     """Random seed. Fits with different seeds show how much results vary by chance."""
     deterministic: bool = False
-    """Make repeated fits on one machine equal bit for bit. The fit then uses one thread and takes longer."""
+    """Make repeated fits on one machine equal bit for bit. The fit then uses one processor thread and takes longer.
+    Set it to see the effect of another option without chance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,14 +93,14 @@ class Tuning:
 
     levels: tuple[int, ...] = (4, 5, 6)
     """Level of the mesh in each stage, 0 to 8. Level n has about 10 · 4^n vertices.
-    Higher levels give finer detail; each takes up to four times the time and memory of the one before."""
+    Higher levels give finer detail. A stage one level higher takes up to four times the time and memory."""
     widths: tuple[int, ...] = (128, 256, 512)
-    """Largest width of the photographs in each stage [px]. Wider photographs are reduced to it.
-    Larger widths give finer detail and take longer."""
+    """Largest width of the photographs in each stage [px]: one number for each of --levels.
+    Wider photographs are reduced to it. Larger widths give finer detail and take longer."""
     shares: tuple[float, ...] = (0.45, 0.46, 0.09)
-    """How the iterations are divided among the stages, from coarse to fine: one number above 0 for each stage.
-    Only the ratios count. A larger last number gives finer detail and takes longer.
-    A fit from a hull or a mesh skips two thirds of the first stage and adds 40 % of the skipped ones to the second."""
+    """Iterations of each stage, from coarse to fine, as a share of all: one number above 0 for each of --levels.
+    Only the ratios count. A larger last number gives finer detail and takes longer. A fit from a hull or a mesh skips
+    two thirds of the iterations of the first stage. It adds 40 % of the skipped ones to the second stage."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. It does not change the fit.
     mi-ring export can write other levels later."""
@@ -118,10 +118,10 @@ class Tuning:
     velocity: the deformation is smooth (the paper's lambda). Raise it for noisy photographs, lower it for fine detail.
     calibration: refined calibration stays near that of the scene file.
     settling: the material varies little in the last stage, under an unknown environment.
-    normal_variation: the surface has flat faces and sharp edges. Start with 0.01 for objects like this.
-    material_rank: the material is a mixture of few materials. Start with 0.01 for objects like this."""
+    normal_variation: the surface has flat faces and sharp edges. Try 0.01 if the object has them.
+    material_rank: the material is a mixture of few materials. Try 0.01 if the object has few materials."""
     velocity_decay: float = 0.03
-    """Share of --weights.velocity that is left at the end of the fit, above 0. 1: the weight stays equal.
+    """Share of --weights.velocity that is left at the end of the fit, above 0. 1: the weight does not change.
     A small share gives finer detail, but the surface may fold over if the fit is short."""
     laplacian_scale: float = 0.01
     """How much the term velocity penalises high frequencies of the deformation, 0 or more (the paper's alpha).
@@ -132,7 +132,7 @@ class Tuning:
     """Learning rate of Muon at the start. Muon trains the hidden layers unless --optimizer is adam.
     Raise it for faster progress; lower it if the loss does not fall steadily."""
     decay: float = 0.1
-    """Share of the learning rates that is left at the end, above 0. 1: the rates stay equal.
+    """Share of the learning rates that is left at the end, above 0. 1: the rates do not change.
     A smaller share gives a steadier end. Learning rates of cameras fall to a half instead."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Number format of matrix products. auto: bfloat16 if it is faster than float32 on this machine.
@@ -145,7 +145,7 @@ class Ablation:
 
     shadows: bool = True
     """Trace the shadows that the photographs' own lights cast on the object.
-    Without shadows a fit is faster, but the surface is wrong, unless each light is at its camera."""
+    With --no-shadows a fit is faster, but the surface is wrong, unless each light is at its camera."""
     indirect: bool = True
     """Predict light that the object reflects onto itself (interreflection), which matters in concave parts.
     Give --no-indirect if the scene file has wrong intensities of the lights."""
@@ -169,7 +169,7 @@ class Ablation:
     More frequencies can represent finer detail, and also more noise."""
     resample: bool = True
     """Sample other points of the start surface in each iteration, so that the networks are trained everywhere.
-    Without it they are trained at the same points only."""
+    With --no-resample they are trained at the same points only."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,13 +62,13 @@ class Source:
     src: Positional[Annotated[Path, arg(metavar="SRC")]]
     """The other tool's data: a file or a folder."""
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
-    """Scene file to write. New files, for example undistorted photographs, go into a folder of its name."""
+    """Scene file to write, for example pot.xml. Other new files, such as undistorted photographs, go to pot/."""
     copy: bool = False
     """Copy the photographs beside the scene file, to keep everything in one place.
     Without it the scene file refers to the originals, which must stay where they are."""
     encoding: Encoding = "auto"
-    """How the pixels of the photographs encode radiance. Set it if auto is wrong.
-    auto: as the format says, otherwise srgb for 8-bit files and linear for others.
+    """How pixel values encode radiance. Set it if auto is wrong. srgb: by the sRGB curve. linear: in proportion.
+    auto: as the format of SRC says; if it does not say, srgb for 8-bit files and linear for others.
     Linear 8-bit files are written again with 16 bits."""
     photographs: Suppress[Sequence[Path] | None] = None
     """The photographs to import; other cameras are ignored. None: all, and each camera must have a photograph."""

@@ -21,7 +21,7 @@ class NamedPhotographs(Source):
 
     images: Path | None = None
     """Folder of the photographs. Without it: where the file says, or the nearest folder `images` beside or above SRC.
-    A photograph is found by its name and as many of its folders as are needed."""
+    A photograph is found by its file name. If several files have this name, the names of their folders decide."""
     masks: Path | None = None
     """Folder of masks: photo.jpg has the mask photo.jpg.png, photo.png or photo.jpg.
     Without it: the masks that the file names, alpha channels, or a folder `masks` beside the photographs."""

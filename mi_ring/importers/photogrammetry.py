@@ -23,10 +23,11 @@ class Photogrammetry(NamedPhotographs):
     """Base class of the photogrammetry formats. Subclasses implement `posed`."""
 
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of the light relative to the camera: right, down and forward [scene units]. Default: at the lens."""
+    """Position of the light relative to the lens: right, down and forward [scene units]. 0 0 0: at the lens.
+    0.1 -0.2 0: 0.1 to the right of the lens and 0.2 above it."""
     exif: bool = True
-    """Correct for different exposures by exposure time, ISO and aperture in EXIF data.
-    Leave it out if EXIF data are wrong or the photographs have been brightened later."""
+    """Correct for different exposures of the photographs, by exposure time, ISO and aperture in their EXIF data.
+    Give --no-exif if these data are wrong or if the brightness of the photographs has been edited."""
 
     def frames(self) -> Iterator[Frame]:
         frames = list(super().frames())

@@ -47,12 +47,12 @@ class RenderConfig(MaterialOptions):
     """Folder for the pictures, or a file FILE.mp4 for a film.
     A picture is linear if the scene names an EXR file, and 8-bit sRGB if the scene names PNG or JPEG."""
     turntable: int = 0
-    """Render this number of pictures while camera and light move once around the object. 0: none."""
+    """Number of pictures of a film: camera and light move once around the object. For example 120. 0: no such film."""
     light_orbit: int = 0
-    """Render this number of pictures while the light moves once around the line from the object to the camera. 0: none.
-    Seen from the object, the angle between light and camera is 45 degrees."""
+    """Number of pictures of a film: the camera stands still, the light moves in a circle around the line of sight.
+    Seen from the object, the angle between light and camera is always 45 degrees. For example 120. 0: no such film."""
     flow: int = 0
-    """Render this number of pictures of the deformation, from the start surface of the fit to the object. 0: none."""
+    """Number of pictures of a film: the start surface deforms into the object. For example 60. 0: no such film."""
     view: str | None = None
     """File name of the photograph whose camera and light --turntable, --light-orbit and --flow use.
     Without it: the first photograph."""
@@ -60,21 +60,23 @@ class RenderConfig(MaterialOptions):
     """Width of the pictures of --turntable, --light-orbit and --flow [px].
     Without it: the width of the photograph that --view names."""
     up: tuple[float, float, float] | None = None
-    """Axis of the turntable, and the up direction of --envmap (x y z).
+    """Direction that points up in the scene, for example 0 0 1: the axis of --turntable and the top of --envmap.
     Without it: the mean up direction of the cameras."""
     envmap: Path | None = None
-    """Environment map that lights the object in place of the scene's lights: EXR or HDR, latitude and longitude."""
+    """EXR or HDR file of an environment map (latitude, longitude). It replaces the lights of the photographs.
+    Lamps of the scene file stay on. A `table` shape is left out."""
     integrator: str | None = None
     """Name of the Mitsuba integrator that computes the light. Without it: photometric, or path with --envmap.
     photometric is fast and predicts photographs as the fit does. It cannot be used with --envmap.
-    path traces all reflections, also in scenes with other objects. It has more noise and does not show a `table`."""
+    path traces all reflections, also in scenes with other objects. It has more noise and leaves out a `table`."""
     format: Literal["png", "exr"] | None = None
     """Format of the pictures. png: 8-bit sRGB. exr: linear radiance.
     Without it: that of the file names in the scene; png for --turntable, --light-orbit and --flow."""
     fps: float = 24.0
-    """Pictures per second of a film, 240 at most."""
+    """Pictures per second of an MP4 film, 240 at most. Fewer pictures per second make the film slower."""
     time: float = 1.0
-    """Which surface to render, as a time of the deformation: 0 is where the fit started, 1 is the finished object."""
+    """Which state of the deformation to render, 0 to 1. 0: the start surface of the fit. 1: the finished object.
+    0.5: the surface after half of the deformation. It does not go with --flow."""
     subdivisions: int | None = None
     """Level of the mesh, with about 10 · 4^level vertices. Without it: the level of the fit.
     Higher levels show finer detail and take more memory."""

@@ -36,13 +36,13 @@ class SynthesizeConfig:
     """Material of the object, for example "principled base_color=0.6,0.2,0.1 roughness=0.3". All forms: see above.
     Without it: principled, with the colours of the mesh file, or with one colour if the file has none."""
     second: str | None = None
-    """Second material, in the places that --pattern says. Without it: the object has one material."""
+    """Second material, in one of the forms above; --pattern says where it is. Without it: a single material."""
     pattern: Annotated[str, arg(metavar="stripes|checks|PICTURE")] = "stripes"
     """Where on the object the second material is.
     stripes: in stripes across the object. checks: in a checkerboard.
     PICTURE: where this picture is bright, projected onto the object from the front."""
     bands: int = 8
-    """Number of stripes or checks over the height of the object, for --second."""
+    """Number of stripes or checks from the bottom of the object to its top, 1 to 1000. Only with --second."""
     smooth: bool = False
     """Subdivide the mesh by Loop's rule until it has 10,000 vertices. Use it for coarse meshes of round objects."""
     radius: float = 50.0
@@ -65,9 +65,10 @@ class SynthesizeConfig:
     around: evenly around the object, aimed at its middle. free: as if hand-held, tilted, at varying distances.
     turntable: the object turns, while the camera and the light of --room stand still."""
     elevations: tuple[float, ...] = (20.0, 55.0)
-    """Height angle of each ring of cameras above the plane of the turntable [deg]. Only for --cameras turntable."""
+    """Angle of the cameras above the plane of the turntable [deg]: one number for each ring of cameras, -89 to 89.
+    20 55: two rings. Only for --cameras turntable."""
     distance: float | None = None
-    """Distance of the cameras from the middle of the object [radii of the object].
+    """Distance of the cameras from the middle of the object, 1.05 to 1000. 3: three times --radius.
     Without it: the object just fills the photograph."""
 
     light: LightKind = "flash"
@@ -78,10 +79,10 @@ class SynthesizeConfig:
     """Number of lamps for --light lamp, 1 to 8.
     The first lamp is the photographs' light; the other lamps are emitters of the scene."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of the flash relative to the lens: left, up and forward.
-    The unit is the distance from the camera to the object."""
+    """Position of the flash relative to the lens: left, up and forward [distance from the camera to the object].
+    0.1 0.2 0: to the left by a tenth of this distance and up by a fifth."""
     spread: float = 40.0
-    """Largest angle between camera and light, seen from the object [deg], 0 to 80. For --light point and distant."""
+    """Largest angle between camera and light, seen from the object [deg], 0 to 80; for --light point and distant."""
     room: float = 0.0
     """Strength of additional light from all sides, as in a room that is not dark, 0 to 10. 0: none.
     1: on a surface that faces --light, both are equally strong. Give 0.05 to 0.2 to test fits of such photographs."""
@@ -92,7 +93,7 @@ class SynthesizeConfig:
     """Render each view a second time, under the light of --room alone.
     The scene file names these second photographs (`ambient`), and a fit subtracts them."""
     environment: Path | None = None
-    """Environment map that lights the object instead of --light and --room: EXR or HDR, latitude and longitude."""
+    """EXR or HDR file of an environment map (latitude, longitude). It replaces the lights of --light and --room."""
     table: Literal["none", "plain", "sheet"] = "none"
     """Table below the object, which hides its underside from cameras and reflects light.
     none: no table. plain: a plain table. sheet: a table with the sheet of mi-ring board; --radius is in millimetres."""
@@ -102,27 +103,29 @@ class SynthesizeConfig:
     exr: linear, half precision. png16: linear, 16 bits. png8: sRGB, 8 bits, like those of most cameras."""
     exposure: float | None = None
     """Brightness of the photographs: linear pixel value of a white surface at the object that faces the light.
-    Without it: chosen by --clipped."""
+    1: such a surface just reaches full scale. Without it: --clipped determines the brightness."""
     clipped: float = 0.02
-    """Share of the object's pixels that are overexposed, 0 to 0.9, to choose the exposure. Not used with --exposure."""
+    """Choose the exposure so that this share of the object's pixels is overexposed, 0 to 0.9. 0.02: 2 % of them.
+    It is not used with --exposure."""
     electrons: float = 0.0
-    """Electrons that a pixel counts at full scale. Fewer electrons give more shot noise. 0: no shot noise."""
+    """Electrons that a pixel counts at full scale, for example 10000. Fewer give more shot noise. 0: no shot noise."""
     read: float = 0.0
-    """Standard deviation of the read noise, equal for dark and bright pixels [electrons]. 0: no read noise.
+    """Standard deviation of the read noise, the same for all pixels [electrons], for example 10. 0: no read noise.
     Without --electrons the unit is 1/10,000 of full scale."""
 
     wrong_cameras: float = 0.0
-    """Standard deviation of errors of the cameras in the scene file, to test --refine cameras. 0: exact cameras.
-    N rotates each camera by N degrees about each axis and moves it by N % of its distance along each axis."""
+    """Random errors of the cameras in the scene file, to test --refine cameras. 0: exact cameras.
+    1: each camera turns by 1 degree about each axis and moves by 1 % of its distance along each axis. These numbers
+    are standard deviations."""
     wrong_light: float = 0.0
-    """Error of the positions of point lights in the scene file [% of the camera's distance]. 0: exact positions.
-    All lights have the same error, in the axes of their cameras."""
+    """Distance by which the scene file misplaces point lights [% of the camera's distance], for example 2. 0: exact.
+    It misplaces all lights in the same direction relative to their cameras. Use it to test --refine light."""
     wrong_power: float = 0.0
-    """Random error of the power of each light in the scene file, to test --refine power: its standard deviation [%].
-    0: exact powers."""
+    """Random errors of the powers of the lights in the scene file: their standard deviation [%], for example 10.
+    0: exact powers. Use it to test --refine power."""
     wrong_exposure: float = 0.0
-    """Standard deviation of the photographs' exposures, which the scene file does not say [%]. 0: equal exposures.
-    The white balance varies by a third of this number."""
+    """Random differences of exposure between photographs: their standard deviation [%], for example 10. 0: none.
+    The white balance varies by a third of it. The scene file says neither. Use it to test --refine gain."""
     wrong_room: bool = False
     """Leave --room, --environment and further --lamps out of the scene file, to test fits in unknown light."""
 
