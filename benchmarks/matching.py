@@ -42,17 +42,6 @@ Pairs = Sequence[tuple[str, str]]
 MATCHERS = "guided", "library", "products", "chosen"
 
 
-def by_library(pairs: Pairs, folder: Path, guided: bool) -> None:
-    """COLMAP's matcher on the processor."""
-    pycolmap = matching.pycolmap
-    options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=guided)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0
-    (folder / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=folder / "pairs.txt")
-    pycolmap.match_image_pairs(folder / "database.db", options, pairing, verification)
-
-
 def match(name: str, pairs: Pairs, folder: Path) -> None:
     """Match pairs of files with one of the `MATCHERS`."""
     if name in ("products", "chosen"):
@@ -60,7 +49,7 @@ def match(name: str, pairs: Pairs, folder: Path) -> None:
         list(progress(matching.match_pairs(pairs, features, folder), name, len(pairs)))
         return
     for batch in progress(list(matching.batches(pairs, matching.BATCH)), name):
-        by_library(batch, folder, name == "guided")
+        matching.match_by_library(batch, folder, name == "guided")
 
 
 def clocked(call: Callable[[], object]) -> tuple[float, float]:

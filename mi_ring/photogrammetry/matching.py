@@ -149,16 +149,21 @@ def match_pair(first: Features, second: Features) -> Any:
     The ratio test finds the geometry. Among matches that agree with the geometry few are wrong even if their ratio is
     near 1 (two similar features on an object, say), so these are kept as well.
     """
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = 0  # otherwise it depends on the thread
     matches, ratios = match_descriptors(first.descriptors, second.descriptors)
     geometry = pycolmap.estimate_two_view_geometry(
-        first.camera, first.points, second.camera, second.points, matches[ratios < RATIO], options
+        first.camera, first.points, second.camera, second.points, matches[ratios < RATIO], verification()
     )
     if len(geometry.inlier_matches):
         a, b = (own.points[column] for own, column in zip((first, second), matches.T))
         geometry.inlier_matches = matches[distances(geometry, a, b) <= FAR]
     return geometry
+
+
+def verification() -> Any:
+    """Options of COLMAP's geometric verification, whose result does not depend on the thread."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    return options
 
 
 def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -229,22 +234,26 @@ def match_again(files: Collection[str], folder: Path, progress: Progress) -> boo
 
     Guided matching searches along the epipolar lines only. It finds more matches, and more wrong ones.
     """
-    database, listed = folder / "database.db", folder / "pairs.txt"
+    database = folder / "database.db"
     pairs = [(a.name, b.name) for a, b, first, _ in read_matches(database)
              if len(first) and (a.name in files or b.name in files)]  # fmt: skip
-    options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0  # otherwise it depends on the thread
     for batch in progress(list(batches(pairs, BATCH)), "matching again"):
         with pycolmap.Database.open(database) as opened:
             ids = {image.name: image.image_id for image in opened.read_all_images()}
             for a, b in batch:
                 opened.delete_matches(ids[a], ids[b])
                 opened.delete_two_view_geometry(ids[a], ids[b])
-        listed.write_text("".join(f"{a} {b}\n" for a, b in batch), "utf-8")
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
-        interruptible(pycolmap.match_image_pairs, database, options, pairing, verification)
+        match_by_library(batch, folder)
     return bool(pairs)
+
+
+def match_by_library(pairs: Sequence[tuple[str, str]], folder: Path, guided: bool = True) -> None:
+    """Match pairs of files by COLMAP's own matcher, `guided` or not, and write the result to its database."""
+    listed = folder / "pairs.txt"
+    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), "utf-8")
+    options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=guided)
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+    interruptible(pycolmap.match_image_pairs, folder / "database.db", options, pairing, verification())
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
