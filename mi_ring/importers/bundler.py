@@ -22,11 +22,11 @@ MAX_CAMERAS = 10**6
 
 @dataclass(frozen=True)
 class Bundler(Photogrammetry):
-    """Bundler: bundle.out with list.txt. The light is beside the camera.
+    """Bundler: bundle.out with list.txt. The light is fixed to the camera.
 
-    SRC is the file, or a folder with bundle.out or bundle/bundle.out. The photographs are named in list.txt, or of
-    pot.bundle.out in pot.list.txt, beside SRC or above it. The file gives no sizes: the photographs must have their
-    original size.
+    SRC is the bundle file, or a folder with bundle.out or bundle/bundle.out. The photographs are listed in list.txt,
+    which is beside the bundle file or one folder above. The list of pot.bundle.out is pot.list.txt. The bundle file
+    does not give the size of the photographs. They must have their original size.
     """
 
     fields = Fields(
@@ -64,7 +64,7 @@ class Bundler(Photogrammetry):
 
 
 def read_cameras(path: Path) -> np.ndarray:
-    """Read the cameras (N, 5, 3) of a bundle file. The five rows: (f, k1, k2), three rows of R, t."""
+    """Read the cameras (N, 5, 3) of a bundle file. The five rows of a camera: (f, k1, k2), the three rows of R, t."""
 
     def read(file: Path) -> tuple[list[str], list[str]]:
         with file.open(encoding="utf-8") as text:
@@ -77,9 +77,9 @@ def read_cameras(path: Path) -> np.ndarray:
 
 
 def count_in(head: list[str], path: Path) -> int:
-    """Read the number of cameras from the first two lines (`head`) of a bundle file.
+    """Return the number of cameras that a bundle file gives in its first two lines, `head`.
 
-    Raises InputError if it is invalid.
+    Raises InputError if these lines are invalid. The message begins with `path`.
     """
     if not head or not head[0].startswith(FIRST_LINE):
         raise InputError(f"{path}: SRC: does not begin with {FIRST_LINE!r}; must be a file of Bundler's, bundle.out")

@@ -1,4 +1,4 @@
-"""Camera models of other tools: lenses as COLMAP's models, and poses."""
+"""Lenses of other tools, converted to COLMAP's camera models, and conversions of poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,10 @@ MAX_SIDE = 10**6  #: of a photograph [px]
 
 @dataclass(frozen=True)
 class Lens:
-    """The intrinsics of a camera, in one of COLMAP's camera models: https://colmap.github.io/cameras.html"""
+    """The intrinsics of a camera, in one of COLMAP's camera models: https://colmap.github.io/cameras.html
+
+    Raises InputError for a panorama, and for a side of the photograph outside 1 to `MAX_SIDE` pixels.
+    """
 
     model: str  #: COLMAP's name
     size: tuple[int, int]  #: (width, height) [px]
@@ -37,7 +40,7 @@ class Lens:
 
     @cached_property
     def colmap(self) -> Any:
-        """Convert the lens to a `pycolmap.Camera`. Raises InputError if pycolmap is not installed."""
+        """The lens as a `pycolmap.Camera`. Raises InputError if pycolmap is not installed."""
         pycolmap = need("pycolmap", f"camera model {self.model}")
         return pycolmap.Camera(model=self.model, width=self.size[0], height=self.size[1], params=list(self.params))
 
@@ -50,16 +53,16 @@ class Lens:
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Principal point (cx, cy) [px]; the first pixel's centre is (0.5, 0.5)."""
+        """Principal point (cx, cy) [px]. The centre of the first pixel is at (0.5, 0.5)."""
         if self.model == "PINHOLE":
             return self.params[2], self.params[3]
         return self.colmap.principal_point_x, self.colmap.principal_point_y
 
     @property
     def is_pinhole(self) -> bool:
-        """Test whether the lens has no distortion.
+        """True if the lens has no distortion.
 
-        It compares rays, because a fisheye without coefficients is no pinhole.
+        It compares rays, because a fisheye lens is no pinhole even if all its coefficients are 0.
         """
         if self.model == "PINHOLE":
             return True
@@ -67,7 +70,7 @@ class Lens:
         return np.allclose(self.colmap.img_from_cam(rays), rays[:, :2] * self.focal + self.centre, atol=1e-6)
 
     def scaled(self, size: tuple[int, int]) -> "Lens":
-        """Return the lens of the same photographs resized to `size` (width, height) [px]."""
+        """Return the lens for the same photographs, resized to `size` (width, height) [px]."""
         if self.model == "PINHOLE":
             return Lens("PINHOLE", size, tuple(np.tile(np.divide(size, self.size), 2) * self.params))
         camera = self.colmap  # cached: a copy is changed
@@ -76,15 +79,18 @@ class Lens:
         return Lens(self.model, size, tuple(camera.params))
 
     def camera(self, pose: np.ndarray) -> Camera:
-        """Return the pinhole camera of the undistorted photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
+        """Return the camera of the undistorted photograph, which is a pinhole with the same intrinsics.
+
+        `pose` (4, 4): camera-to-world, with OpenCV's camera axes.
+        """
         return Camera(pose @ MITSUBA, np.array(self.focal), np.array(self.centre), self.size)
 
 
 def pinhole_lens(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
-    """Make a lens without distortion from the calibration matrix `K` (3, 3). `size`: (width, height) [px].
+    """Make a lens without distortion. `K` (3, 3): calibration matrix. `size`: (width, height) [px].
 
-    `shift` [px] is added to the principal point: 0.5 if the other tool puts the first pixel's centre at 0. Raises
-    InputError for a matrix with skew; `what` begins the message.
+    `shift` [px] is added to cx and cy. It is 0.5 if the other tool puts the centre of the first pixel at 0. Raises
+    InputError if `K` has skew, or if K[2, 2] is 0. The message begins with `what`.
     """
     if not K[2, 2]:
         raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
@@ -106,14 +112,14 @@ def opencv_lens(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: S
 
 
 def pose_of(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Join a rotation R (3, 3) and a translation t (3,) to a pose (4, 4)."""
+    """Return the pose (4, 4) with the rotation R (3, 3) and the translation t (3,)."""
     return np.block([[R, np.reshape(t, (3, 1))], [np.eye(4)[3:]]])
 
 
 def rotation_of(quaternion: object, what: str) -> np.ndarray:
     """Convert a unit quaternion (x, y, z, w) to a rotation matrix (3, 3).
 
-    Raises InputError if its length is not 1; `what` begins the message.
+    Raises InputError if the quaternion's length is not 1. The message begins with `what`.
     """
     numbers = matrix(quaternion, (4,), what)
     if abs(length := np.linalg.norm(numbers) - 1) > 1e-2:
@@ -122,14 +128,14 @@ def rotation_of(quaternion: object, what: str) -> np.ndarray:
 
 
 def camera_to_world(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Camera-to-world pose (4, 4) of a camera with the extrinsics x_camera = R x_world + t."""
+    """Return the camera-to-world pose (4, 4) for the extrinsics R (3, 3), t (3,): x_camera = R x_world + t."""
     return pose_of(R.T, -R.T @ t)
 
 
 def decompose_projection(P: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Decompose a projection matrix (3, 4). Returns (calibration matrix (3, 3), camera-to-world pose (4, 4)).
 
-    Raises InputError if the matrix is singular; `what` begins the message.
+    Raises InputError if the matrix is singular. The message begins with `what`.
     """
     if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.linalg.norm(P[:, :3]) ** 3:
         raise InputError(f"{what}: is no projection matrix of a camera (singular)")

@@ -26,10 +26,10 @@ pycolmap.Reconstruction(sys.argv[1])
 
 @dataclass(frozen=True)
 class Colmap(Photogrammetry):
-    """COLMAP, text or binary, with rigs or without. The light is beside the camera.
+    """COLMAP, text or binary, with rigs or without. The light is fixed to the camera.
 
-    SRC is the folder of the model (cameras, images), or a folder with models in sparse/0, sparse/1, … or sparse. Of
-    several the one with the most photographs is taken.
+    SRC is the folder of a model (files cameras and images), or a folder with models in sparse/0, sparse/1, … or sparse.
+    If there are several models, the one with the most photographs is used.
     """
 
     fields = Fields(
@@ -46,9 +46,10 @@ class Colmap(Photogrammetry):
 
     @staticmethod
     def model(src: Path) -> Path | None:
-        """Find the model with the most photographs in or below the folder `src`.
+        """Find a COLMAP model: in `src`, else in sparse, sparse/*, colmap/sparse/* or * below `src`.
 
-        Returns its folder, or None without a model.
+        Returns the folder of the model, or None if there is no model. The first of these places that has a model is
+        used. If it has several, the one with the most photographs is used.
         """
         inside = ((src / inner).glob("*") for inner in ("sparse", "colmap/sparse", "."))
         for places in ([src], [src / "sparse"], *inside):
@@ -102,12 +103,15 @@ class Colmap(Photogrammetry):
 
 
 def is_model(folder: Path) -> bool:
-    """Test whether a folder contains the images file of a COLMAP model."""
+    """Return whether a folder contains a COLMAP model, that is, images.bin or images.txt."""
     return any((folder / name).is_file() for name in ("images.bin", "images.txt"))
 
 
 def camera_lines(path: Path) -> Iterator[tuple[int, list[bytes]]]:
-    """Yield (line number, words) of each line of 2-D points in images.txt. It follows the line of its camera."""
+    """Yield (line number, words) of each line of 2-D points in images.txt.
+
+    In this file, two lines describe a camera. The line of 2-D points is the second.
+    """
     lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
     for number, line in lines:
         if line.strip() and not line.lstrip().startswith(b"#"):
@@ -115,7 +119,7 @@ def camera_lines(path: Path) -> Iterator[tuple[int, list[bytes]]]:
 
 
 def count_images(folder: Path) -> int:
-    """Read how many photographs the model in `folder` has."""
+    """Return the number of photographs of the COLMAP model in `folder`. It reads the images file."""
     binary = folder / "images.bin"
     if binary.is_file():
         with binary.open("rb") as file:
@@ -124,9 +128,9 @@ def count_images(folder: Path) -> int:
 
 
 def require_points(folder: Path) -> None:
-    """Raise InputError if a camera in images.txt is not followed by its line of 2-D points, which may be empty.
+    """Raise InputError if a camera in images.txt has no line of 2-D points after it. This line may be empty.
 
-    COLMAP would take the next camera for this line, and lose it.
+    Without this line, COLMAP would read the next camera as points, and that camera would be lost. Binary models pass.
     """
     if (folder / "images.bin").is_file():
         return

@@ -1,4 +1,4 @@
-"""From frames to a scene file: the work of `mi-ring convert`."""
+"""Writes the scene file for an importer's frames. This is the work of `mi-ring convert`."""
 
 import contextlib
 import shutil
@@ -26,9 +26,9 @@ UNREAD = {
 
 
 def write_scene(source: Source) -> list[Frame]:
-    """Write the scene file and all images that must change. Returns the frames.
+    """Write the scene file `source.scene`, and new files of those images that must change. Returns the frames.
 
-    Raises InputError before it writes anything.
+    If the input is invalid, it raises InputError and leaves no new files.
     """
     frames = frames_of(source)
     require_most(source, frames)
@@ -61,7 +61,7 @@ def write_scene(source: Source) -> list[Frame]:
 
 
 def require_most(source: Source, frames: Sequence[Frame]) -> None:
-    """Raise InputError if no photograph has a pose, or if most cameras have no photograph."""
+    """Raise InputError if no photograph has a pose, or if more than half of the cameras have no photograph."""
     if source.without_pose and not frames and not source.without_photograph:
         raise InputError(f"{source.src}: SRC: none of {len(source.without_pose)} photographs has a pose")
     if (lost := len(source.without_photograph)) > len(frames):
@@ -71,7 +71,10 @@ def require_most(source: Source, frames: Sequence[Frame]) -> None:
 
 
 def unread(source: Source) -> str:
-    """Name, in a clause for the user, unsupported file formats of the missing photographs; empty if there are none."""
+    """Return a clause for an error message: which file formats of the missing photographs are not supported.
+
+    It looks in `source.folder` for files with the names of missing photographs. Returns "" if it finds none.
+    """
     stems = {stem_of(parts_of(name)[-1]) for name in source.without_photograph if parts_of(name)}
     found = (file for file in source.folder.rglob("[!.]*") if stem_of(file.name.lower()) in stems)
     kinds = {file.suffix.lower() for file in found if file.is_file()} & UNREAD
@@ -79,7 +82,7 @@ def unread(source: Source) -> str:
 
 
 def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
-    """List, for the user, the encoding, lens distortion, lights and exposures with which the scene file was written."""
+    """Return clauses that tell the user what the scene file assumes: encoding, lens distortion, lights, exposures."""
     given = [source.encoding if source.encoding != "auto" else frame.encoding for frame in frames]
     files = [frame.image for frame, encoding in zip(frames, given) if encoding == "auto" and frame.pixels is None]
     found = encodings(files)
@@ -96,13 +99,16 @@ def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
 
 
 def unused_in(files: Iterable[Path]) -> list[str]:
-    """List the metadata fields of image files that mi_ring does not use, a sentence for each field."""
+    """Return sentences about metadata fields of the image files that mi_ring does not use.
+
+    There is one sentence for each field, and at most five: those of the most frequent fields.
+    """
     found = Counter(f"{name} ({why})" for file in files for name, why in read_as(file, "image", unused_fields).items())
     return [f"Not used in {count} photographs: {' '.join(what.split())[:99]}" for what, count in found.most_common(5)]
 
 
 def report(source: Source, frames: Sequence[Frame]) -> str:
-    """Write the report for the user: what was left out and why, what was used, what was assumed; one line each."""
+    """Return the text of the report: what was left out and why, what was used, what was assumed. It prints nothing."""
     lines = list(source.notes)
     total = len(frames) + len(source.without_pose)
     if source.without_pose:

@@ -17,7 +17,7 @@ from mi_ring.importers.reading import chosen, entry, existing, image_size, load_
 class DiligentMV(Source):
     """DiLiGenT-MV: an object on a turntable, 20 views under 96 distant lights each.
 
-    SRC is the folder of an object, such as mvpmsData/bearPNG, with Calib_Results.mat, view_01, view_02, …
+    SRC is the folder of one object, such as mvpmsData/bearPNG. It contains Calib_Results.mat, view_01, view_02, …
     """
 
     fields = Fields(
@@ -73,6 +73,6 @@ class DiligentMV(Source):
 
     @property
     def truth(self) -> Path | None:
-        """Path of the ground-truth mesh; None if there is none."""
+        """Path of the ground-truth mesh, or None if SRC has none."""
         mesh = self.src / "mesh_Gt.ply"
         return mesh if mesh.is_file() else None

@@ -1,4 +1,4 @@
-"""All formats, by their names in `mi_ring.convert`, and how they are recognised."""
+"""All formats, by the names that `mi_ring.convert` uses, and functions that recognise the format of a file."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -43,28 +43,28 @@ class Sign(NamedTuple):
 
 
 def has(*fields: str) -> Callable[[Path], bool]:
-    """Return a test whether a file is a JSON object in which at least one of these fields is not empty."""
+    """Make a function of a path: it returns whether the file is a JSON object in which one of `fields` is not empty."""
     return lambda path: isinstance(top := load_json(path), dict) and any(top.get(field) for field in fields)
 
 
 def has_files(*names: str) -> Callable[[Path], bool]:
-    """Return a test whether a folder contains at least one of these files."""
+    """Make a function of a path: it returns whether this folder contains at least one of the files `names`."""
     return lambda path: any((path / name).is_file() for name in names)
 
 
 def has_sidecars(folder: Path) -> bool:
-    """Test whether a folder contains an XMP sidecar with a camera pose."""
+    """Return whether a folder contains an XMP sidecar with a camera pose."""
     return any(accepts(lambda path: "Rotation" in xmp_fields(load_xml(path)), file) for file in folder.glob("*.xmp"))
 
 
 def has_keyframes(folder: Path) -> bool:
-    """Test whether a folder, or its subfolder `keyframes`, contains Polycam cameras."""
+    """Return whether a folder, or its subfolder `keyframes`, contains Polycam cameras."""
     cameras = (next(place.glob("*cameras/[!.]*.json"), None) for place in (folder, folder / "keyframes"))
     return any(isinstance(own := load_json(path), dict) and "t_00" in own for path in cameras if path)
 
 
 def begins(path: Path, word: bytes) -> bool:
-    """Test whether the first bytes of a file are `word`."""
+    """Return whether the first bytes of a file are `word`."""
     with path.open("rb") as file:
         return file.read(len(word)) == word
 
@@ -96,7 +96,7 @@ SIGNS = (
 
 
 def signs_in(place: Path) -> Iterator[tuple[str, Path]]:
-    """Yield (format name, SRC path) of all camera files found in `place`, which is a folder or one file."""
+    """Yield (format name, SRC path) for each camera file found in `place`, which is a folder or one file."""
     for sign in SIGNS:
         if not place.is_dir():
             paths = [place] if place.suffix.lower() in {Path(name).suffix for name in sign.files} else []
@@ -108,11 +108,11 @@ def signs_in(place: Path) -> Iterator[tuple[str, Path]]:
 
 
 def detect(folder: Path) -> Source | None:
-    """Find camera files in a folder of photographs, otherwise in its parent.
+    """Find camera files in a folder of photographs. If there are none, look in its parent folder.
 
-    Returns their importer; None without cameras. The first match in the order of `SIGNS` is taken; of several files,
-    the first by name. Formats whose photographs are not ordinary ones are left out. The importer looks for photographs
-    in `folder`, if there are any; transforms.json names its own.
+    Returns an importer for the camera files, or None if there are none. If several formats match, the first in `SIGNS`
+    is used. If several files match, the first by name is used. Formats that need special photographs are ignored. The
+    importer looks for photographs in `folder` if that contains images. Only transforms.json says itself where they are.
     """
     images = folder if list_images(folder) else None
     for place in (folder, folder.absolute().parent):
@@ -126,7 +126,7 @@ def detect(folder: Path) -> Source | None:
 
 
 def guess(src: Path) -> tuple[str, Path]:
-    """Recognise the format of a file or folder. Returns (format name, path to give as SRC).
+    """Recognise the format of `src`, a file or folder. Returns (format name, path to give as SRC).
 
     Raises InputError if no format or several formats match.
     """
@@ -141,7 +141,7 @@ def guess(src: Path) -> tuple[str, Path]:
 
 
 def accepts(check: Callable[[Path], Any], path: Path) -> bool:
-    """Return whether `check(path)` is true. A file that cannot be read does not pass."""
+    """Return whether `check(path)` is true. Returns False if the file cannot be read."""
     try:
         return bool(check(path))
     except (InputError, OSError, LookupError):

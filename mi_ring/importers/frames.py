@@ -1,4 +1,4 @@
-"""Frames, the output of all importers: photographs with their cameras and lights."""
+"""Frames, which all importers yield: photographs with their cameras and lights."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,7 +25,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: from OpenGL's camera axes (x right,
 
 @dataclass
 class Frame:
-    """A photograph with its camera, light and masks, as an importer found it."""
+    """A photograph with its camera, light and mask, as an importer read them. Lens distortion is still in it."""
 
     image: Path
     lens: Lens
@@ -42,20 +42,20 @@ class Frame:
 
     @property
     def camera(self) -> Camera:
-        """The pinhole camera of the undistorted photograph."""
+        """The pinhole camera of the photograph once its distortion is removed."""
         return self.lens.camera(self.pose)
 
     def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
-        """Make a point light of intensity `rgb` (3,) that is fixed to the camera.
+        """Return a point light that is fixed to the camera. `rgb` (3,): its intensity. The frame does not change.
 
-        `offset` (3,): its position relative to the camera, in the camera's axes [scene units].
+        `offset` (3,): position of the light relative to the camera: right, down, forward [scene units].
         """
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
 
 
 @dataclass(frozen=True)
 class Source:
-    """The base class of all importers, with the options that all formats share."""
+    """Base class of all importers. It has the options that all formats share."""
 
     fields: ClassVar[Fields]  #: of the format
 
@@ -74,43 +74,46 @@ class Source:
     """The photographs to import; other cameras are ignored. None: all, and each camera must have a photograph."""
 
     def frames(self) -> Iterator[Frame]:
-        """Read the photographs that have a pose. Raises InputError for invalid data."""
+        """Yield the photographs that have a pose. Raises InputError for invalid data."""
         raise NotImplementedError
 
     @cached_property
     def without_pose(self) -> set[str]:
-        """Names of photographs without a pose. Complete only after all `frames` have been read."""
+        """Names of photographs without a pose. The set is complete once `frames` has yielded all photographs."""
         return set()
 
     @cached_property
     def without_photograph(self) -> list[str]:
-        """Names of cameras without a photograph. Complete only after all `frames` have been read."""
+        """Names of cameras without a photograph. The list is complete once `frames` has yielded all photographs."""
         return []
 
     @cached_property
     def notes(self) -> list[str]:
-        """Sentences for the user about choices and unused data. Complete only after all `frames` have been read."""
+        """Sentences for the user about choices and unused data. Complete once `frames` has yielded all photographs."""
         return []
 
     def tell_unused(self, file: Path, names: Iterable[str]) -> None:
-        """Add a note about those of the fields `names` in `file` that mi_ring does not use although they may matter."""
+        """Add a note about fields of `file` that mi_ring does not use although they may matter.
+
+        `names`: all fields of the file. The note does not name fields that are used or harmless.
+        """
         if unused := self.fields.unused(names):
             words = [f"{' '.join(name.split())[:60]} ({why})" for name, why in unused.items()]
             self.notes.append(f"{file}: not used: {', '.join(words[:9])}{', …' * (len(words) > 9)}")
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs."""
+        """Folder that contains the photographs."""
         return self.src
 
     @property
     def available(self) -> Sequence[Path]:
-        """Image files that may be photographs; empty if the format uses every image that it finds."""
+        """Image files that may be photographs. Empty for a format that uses every image it finds."""
         return []
 
 
 def frames_of(source: Source) -> list[Frame]:
-    """Read all frames of an importer. Any error of the importer becomes an InputError."""
+    """Return all frames of an importer. Converts any error of the importer to an InputError."""
     try:
         return list(source.frames())
     except InputError:
@@ -121,15 +124,20 @@ def frames_of(source: Source) -> list[Frame]:
 
 
 def is_scaled(size: Sequence[int], original: Sequence[int]) -> bool:
-    """Test whether `size` is `original` resized by at least 5 %, with equal proportions; both (width, height) [px]."""
+    """Return whether an image of size `original` becomes one of `size` if it is resized with equal proportions.
+
+    Both are (width, height) [px]. Returns False if the sizes differ by less than 5 %.
+    """
     factor = max(size) / max(original)
     return abs(factor - 1) > 0.05 and all(abs(a - factor * b) <= 1 for a, b in zip(size, original))
 
 
 def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
-    """Adapt a frame's lens to its image file: `size` (width, height) [px] as stored, and EXIF `orientation`.
+    """Fit a frame's lens to its image file. `size` (width, height) [px]: of the file. `orientation`: by EXIF.
 
-    Returns for the user what was changed; empty if nothing was. A lens whose size has other proportions is not changed.
+    If the photograph was resized, the lens is scaled. If the lens is that of the upright photograph,
+    `frame.orientation` is set. Returns a clause that tells the user what was changed; empty if nothing was. If the
+    proportions of lens and file differ, nothing is changed.
     """
     done = ""
     if size != frame.lens.size and orientation > 4 and (
@@ -145,13 +153,16 @@ def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
 
 
 def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
-    """Call `adapt` for all frames. Its messages are added to the notes of `source`."""
+    """Call `adapt` for all frames that have an image file of their own. Adds its messages to `source.notes`."""
     done = [adapt(f, image_size(f.image), orientation_of(f.image)) for f in frames if f.pixels is None]
     source.notes.extend(f"{count} {what}" for what, count in Counter(filter(None, done)).items())
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
-    """Raise InputError if there are no frames, if an image and its camera differ in size, or like `require_cameras`."""
+    """Raise InputError if there are no frames, or if the size of a photograph or mask is not that of its camera.
+
+    It also calls `require_cameras`. `source`: path for the message.
+    """
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")
     require_cameras(frames)

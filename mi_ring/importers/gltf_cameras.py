@@ -22,10 +22,10 @@ CHILD = "_Orientation"
 
 @dataclass(frozen=True)
 class GltfCameras(Photogrammetry):
-    """Blender's cameras: File > Export > glTF 2.0 with cameras. The light is beside the camera.
+    """Blender's cameras: File > Export > glTF 2.0 with cameras. The light is fixed to the camera.
 
-    SRC is the .gltf or .glb. A photograph has the name of its camera's object, or of its camera. glTF has neither lens
-    distortion nor a shift of the lens: the principal point is in the middle.
+    SRC is the .gltf or .glb file. A photograph must have the name of its camera object in Blender, or of its camera.
+    glTF stores neither lens distortion nor lens shift. The principal point is therefore in the middle.
     """
 
     fields = Fields(
@@ -65,28 +65,31 @@ class GltfCameras(Photogrammetry):
 
 
 def read_gltf(path: Path) -> pygltflib.GLTF2:
-    """Read a glTF file without its buffers."""
+    """Read a glTF file, but not the buffer files that it names."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: SRC: must end in {' or '.join(SUFFIXES)}")
     return read_as(path, "glTF", lambda file: pygltflib.GLTF2().load(str(file)))
 
 
 def has_cameras(path: Path) -> bool:
-    """Test whether a glTF file has at least two cameras. A single one may be that of a viewer."""
+    """Return whether a glTF file has at least two cameras. A single camera may be that of a viewer."""
     return sum(node.camera is not None for node in read_gltf(path).nodes) > 1
 
 
 def entry(things: list, index: object, what: str) -> pygltflib.Property:
-    """Return `things[index]`. Raises InputError if the index from the file is invalid; `what` begins the message."""
+    """Return `things[index]`, where `index` comes from a file.
+
+    Raises InputError if the index is invalid. The message begins with `what`.
+    """
     if not isinstance(index, int) or not 0 <= index < len(things):
         raise InputError(f"{what}: is {str(index)[:40]}; there is none of this number")
     return things[index]
 
 
 def placed_nodes(gltf: pygltflib.GLTF2, path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield (node number, node-to-world transform (4, 4)) for all nodes.
+    """Yield (node number, node-to-world transform (4, 4)) for each node.
 
-    Raises InputError if the node tree has a loop.
+    Raises InputError if a node has several parents. The message begins with `path`.
     """
     inner = {child for node in gltf.nodes for child in node.children or ()}
     waiting = [(k, np.eye(4)) for k in range(len(gltf.nodes)) if k not in inner]
@@ -103,7 +106,7 @@ def placed_nodes(gltf: pygltflib.GLTF2, path: Path) -> Iterator[tuple[int, np.nd
 
 
 def transform_of(node: pygltflib.Node, what: str) -> np.ndarray:
-    """Node-to-parent transform (4, 4): from the node's column-major matrix, or from translation, rotation and scale."""
+    """Return the node-to-parent transform (4, 4): the node's matrix, or else its translation, rotation and scale."""
     if node.matrix is not None:
         return matrix(node.matrix, (16,), f"{what}.matrix").reshape(4, 4).T
     R = rotation_of(node.rotation or [0, 0, 0, 1], f"{what}.rotation")
@@ -112,9 +115,10 @@ def transform_of(node: pygltflib.Node, what: str) -> np.ndarray:
 
 
 def rigid(place: np.ndarray, what: str) -> np.ndarray:
-    """Remove the scale from a transform (4, 4); a camera's picture does not depend on it.
+    """Return a node-to-world transform (4, 4) without its scale. A camera's picture does not depend on this scale.
 
-    Raises InputError if the transform shears or mirrors; `what` begins the message.
+    Raises InputError if the transform shears or mirrors, or if axes have different scales. The message begins with
+    `what`.
     """
     scale = np.cbrt(np.linalg.det(place[:3, :3]))
     if not scale > 0 or not np.allclose(place[:3, :3].T @ place[:3, :3], scale**2 * np.eye(3), atol=1e-4 * scale**2):
@@ -124,7 +128,11 @@ def rigid(place: np.ndarray, what: str) -> np.ndarray:
 
 
 def lens_of(perspective: pygltflib.Perspective, image: Path, what: str) -> Lens:
-    """Make the lens of the photograph `image` from a glTF camera: vertical field of view [rad] and aspect ratio."""
+    """Make the lens of a glTF camera for the photograph `image`, whose size is read from its file.
+
+    The glTF camera gives the vertical field of view [rad] and the aspect ratio. Raises InputError if they are invalid
+    or do not fit the photograph. The message begins with `what`.
+    """
     yfov = float(matrix(perspective.yfov, (), f"{what}: yfov"))
     if not 0 < yfov < math.pi:
         raise InputError(f"{what}: yfov: is {yfov:g}; must be between 0 and pi")

@@ -16,7 +16,7 @@ from mi_ring.importers.reading import image_size, load_json, matrix
 class Iron(NamedPhotographs):
     """IRON: cam_dict_norm.json beside a folder image. The light is at the camera.
 
-    SRC is that folder, or a folder that has it as train.
+    SRC is the file, or a folder with cam_dict_norm.json or train/cam_dict_norm.json.
     """
 
     fields = Fields(used={"K": "calibration matrix", "W2C": "pose, world-to-camera", "img_size": "of the photograph"})

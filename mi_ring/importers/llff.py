@@ -16,10 +16,10 @@ from mi_ring.importers.reading import existing, image_size, list_images, matrix
 
 @dataclass(frozen=True)
 class Llff(Photogrammetry):
-    """LLFF, NeRF: poses_bounds.npy beside folders images, images_4, … The light is beside the camera.
+    """LLFF, NeRF: poses_bounds.npy beside folders images, images_4, … The light is fixed to the camera.
 
-    SRC is the folder of poses_bounds.npy. The photographs are in the first folder of images; sorted by name, they have
-    the order of the poses.
+    SRC is the folder of poses_bounds.npy. The photographs are in images. If this is empty, they are in images_4 or the
+    like. Their order by name must be the order of the poses.
     """
 
     fields = Fields(

@@ -20,10 +20,11 @@ MAX_SKEW = 0.1  #: largest shift of a pixel by b2 [px]
 
 @dataclass(frozen=True)
 class Metashape(Photogrammetry):
-    """Metashape: File > Export > Export Cameras as Agisoft XML. The light is beside the camera.
+    """Metashape: File > Export > Export Cameras as Agisoft XML. The light is fixed to the camera.
 
-    SRC is the XML file. Photographs are found by the labels of the cameras, with any suffix. Disabled cameras have no
-    pose. A camera of a rig has the pose of its master, moved by location and rotation of its sensor.
+    SRC is the XML file. The label of a camera is the name of its photograph, with any suffix. Disabled cameras count as
+    cameras without a pose. In a rig, each camera has the pose of the master camera, followed by its sensor's rotation
+    and location.
     """
 
     fields = Fields(
@@ -104,12 +105,12 @@ class Metashape(Photogrammetry):
 
 
 def find_chunk(root: ElementTree.Element) -> ElementTree.Element | None:
-    """Find the chunk in a Metashape XML file; None if it is another kind of file."""
+    """Return the <chunk> element of a Metashape XML file. Returns None for another kind of file."""
     return root.find("chunk") if root.tag == "document" else None
 
 
 def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.Element | None:
-    """Find the child at `path` of the first parent that has one; None if no parent has."""
+    """Return the child at `path` of the first parent that has one. Returns None if no parent has one."""
     children = (parent.find(path) for parent in parents if parent is not None)
     return next((child for child in children if child is not None), None)
 
@@ -117,9 +118,10 @@ def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.
 def numbers(
     parent: ElementTree.Element, name: str, shape: tuple[int, ...], what: str, default: np.ndarray | None = None
 ) -> np.ndarray:
-    """Read numbers of this `shape` from the text of the child element `name`.
+    """Return the numbers in the text of `parent`'s child element `name`, as an array of this `shape`.
 
-    Raises InputError if they are invalid, or missing without a `default`; `what` begins the message.
+    If the element is missing, `default` is returned. Raises InputError if the numbers are invalid, or if the element is
+    missing and there is no `default`. The message begins with `what`.
     """
     text = parent.findtext(name)
     if text is None and default is not None:
@@ -129,9 +131,10 @@ def numbers(
 
 
 def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.ndarray:
-    """Convert a pose (4, 4) from the chunk's frame to the world frame.
+    """Convert a camera-to-chunk pose (4, 4) to the camera-to-world pose (4, 4).
 
-    `transform`: the XML element with rotation, translation and scale, each of which may be missing.
+    `transform`: the XML element with rotation, translation and scale of the chunk. Each of the three may be missing.
+    Raises InputError if the scale is not positive. The message begins with `what`.
     """
     rotation = numbers(transform, "rotation", (3, 3), what, np.eye(3))
     shift = numbers(transform, "translation", (3,), what, np.zeros(3))
@@ -142,9 +145,10 @@ def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.
 
 
 def in_rig(sensor: ElementTree.Element, master: ElementTree.Element, what: str) -> np.ndarray:
-    """Pose (4, 4) of a rig's `sensor` relative to the master sensor.
+    """Return the pose (4, 4) of a rig's `sensor` relative to the sensor of the `master` camera.
 
-    Raises InputError if the pose is missing, or relative to a sensor other than `master`; `what` begins the message.
+    Raises InputError if the pose is missing, or if it is relative to a different sensor. The message begins with
+    `what`.
     """
     if sensor.get("master_id") != master.get("sensor_id"):
         raise InputError(f"{what}: master_id: is {sensor.get('master_id')!r}, but the master of its camera has sensor "
@@ -153,7 +157,10 @@ def in_rig(sensor: ElementTree.Element, master: ElementTree.Element, what: str) 
 
 
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
-    """Make the lens of a sensor. The formulas are in appendix D of Metashape's manual."""
+    """Make the lens of a <sensor> element. The formulas are in appendix D of Metashape's manual.
+
+    Raises InputError if this kind of lens is not supported. The message begins with `what`.
+    """
     if sensor.get("type", "frame") not in KINDS:  # a panorama has no calibration
         raise InputError(f"{what}: type: is {sensor.get('type')!r}; must be frame or fisheye; leave such "
                          "photographs out")  # fmt: skip

@@ -13,9 +13,9 @@ from mi_ring.importers.reading import image_size, load_lines, matrix
 
 @dataclass(frozen=True)
 class Middlebury(Photogrammetry):
-    """Middlebury's multi-view stereo: NAME_par.txt beside its photographs. The light is beside the camera.
+    """Middlebury's multi-view stereo: NAME_par.txt beside its photographs. The light is fixed to the camera.
 
-    SRC is that file or its folder.
+    SRC is NAME_par.txt or its folder.
     """
 
     fields = Fields(used={

@@ -1,4 +1,4 @@
-"""What formats have in common that name the file of each photograph."""
+"""Base class of formats in which the camera file names the image file of each photograph."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence, Sized
@@ -15,7 +15,7 @@ from mi_ring.importers.reading import first_file, has_alpha, images_below
 
 @dataclass(frozen=True)
 class NamedPhotographs(Source):
-    """Base class of formats that name the file of each photograph. Subclasses implement `posed`."""
+    """Base class of formats that name the image file of each photograph. Subclasses implement `posed`."""
 
     names: ClassVar[tuple[str, ...]] = ()  #: of the file of cameras, where SRC is a folder
 
@@ -27,31 +27,34 @@ class NamedPhotographs(Source):
     Without it: the masks that the file names, alpha channels, or a folder `masks` beside the photographs."""
 
     def posed(self) -> Iterator[Frame]:
-        """Yield the photographs that have a pose. Each sets `Frame.said` to the path that it passed to `photograph`."""
+        """Yield the photographs that have a pose.
+
+        An implementation calls `photograph` with a path from the camera file, and stores this path in `Frame.said`.
+        """
         raise NotImplementedError
 
     @property
     def cameras(self) -> Path:
-        """Path of the camera file: SRC itself or, in a folder SRC, one of `names`.
+        """Path of the camera file: SRC itself, or the first of `names` that exists if SRC is a folder.
 
-        Raises InputError if there is none.
+        Raises InputError if none exists.
         """
         return first_file([self.src / name for name in self.names], "SRC") if self.src.is_dir() else self.src
 
     @property
     def beside(self) -> Path:
-        """Folder of the camera file. It is SRC itself for a format without a single camera file."""
+        """Folder of the camera file. If SRC is a folder and the format has no single camera file, it is SRC itself."""
         return self.src if self.src.is_dir() and not self.names else self.cameras.parent
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs. Formats with another rule override it."""
+        """Folder of the photographs: `images` if given, else a folder named images near the camera file, or `beside`."""
         candidates = (self.beside / "images", self.beside.parent / "images")
         return self.images or next((folder for folder in candidates if folder.is_dir()), self.beside)
 
     @cached_property
     def photograph_files(self) -> PhotographFiles:
-        """Index of the files that may be photographs: those in `photographs` if given, otherwise all in `folder`."""
+        """Index of the files that may be photographs: `photographs` if given, else all images in and below `folder`."""
         if self.photographs is not None:
             return PhotographFiles(self.photographs, self.photographs[0].parent if self.photographs else Path())
         return PhotographFiles(images_below(self.folder), self.folder)
@@ -61,10 +64,11 @@ class NamedPhotographs(Source):
         return self.photograph_files.ordinary
 
     def photograph(self, path: str, what: str, relative: bool = False) -> Path | None:
-        """Find the image file for a photograph's `path` in the camera file. If there is none, returns None.
+        """Return the image file of the photograph that the camera file calls `path`.
 
-        The path is then added to `without_photograph`. `relative`: may the path be relative to the folder of the camera
-        file? Raises InputError if several image files match; `what` begins the message.
+        If no file matches, it returns None and adds `path` to `without_photograph`. `relative`: first try `path`
+        relative to the folder of the camera file. Raises InputError if several files match equally well. The message
+        begins with `what`.
         """
         if relative and self.photographs is None and self.images is None and is_file(self.beside / path):
             return Path(os.path.normpath(self.beside / path))  # equal to the one in `available`
@@ -77,9 +81,9 @@ class NamedPhotographs(Source):
         return found
 
     def largest(self, models: Sequence[Sized], what: str) -> int:
-        """Return the index of the model with the most photographs.
+        """Return the index of the model with the most photographs. The length of a model is its number of photographs.
 
-        Adds a note about the others; `what` names them there.
+        It adds a note that the other models are not used. `what`: the plural noun for models in this note.
         """
         sizes = [len(model) for model in models]
         best = sizes.index(max(sizes))
@@ -89,9 +93,11 @@ class NamedPhotographs(Source):
         return best
 
     def mask_at(self, path: str, what: str) -> Path:
-        """Find the mask for a `path` in the camera file: relative to that file, else by name in the folder --masks.
+        """Return the mask file that the camera file calls `path`.
 
-        Raises InputError if there is none; `what` begins the message.
+        `path` may be relative to the camera file. Otherwise a file of this name is looked for in and below the folder
+        `masks`. Without this option, it is looked for below the folder of the camera file. Raises InputError if there
+        is none. The message begins with `what`.
         """
         if is_file(file := self.beside / path):
             return file
@@ -113,9 +119,11 @@ class NamedPhotographs(Source):
         yield from frames
 
     def find_masks(self, frames: list[Frame]) -> None:
-        """Set the mask of each frame: from the folder `masks`, else from alpha channels or a masks folder nearby.
+        """Find the masks of all frames, and set `mask` of each frame.
 
-        Raises InputError if the folder `masks` lacks the mask of a photograph.
+        With the option `masks`, they come from this folder. Raises InputError if a photograph has no mask there.
+        Without the option, they come from the alpha channels of the photographs, and then from a folder named masks
+        near the photographs. Then a photograph may have no mask.
         """
         folder, root = self.masks, self.photograph_files.root
         if folder is not None and not folder.is_dir():
@@ -156,11 +164,11 @@ class NamedPhotographs(Source):
 
 
 def counted(things: Sized, word: str) -> str:
-    """Format the number of `things` with the noun `word`, which is singular for one thing."""
+    """Return, for example, "1 mask" or "3 masks": the length of `things`, and the noun. `word`: the noun's singular."""
     return f"{len(things)} {word}{'s' * (len(things) != 1)}"
 
 
 def few(names: Iterable[str]) -> str:
-    """List for a message the first three file names in alphabetical order, without their folders."""
+    """Return the first three file names in alphabetical order, as one text for a message. Folders are left out."""
     some = sorted({" ".join(name_of(name).split())[:99] for name in names})
     return ", ".join(some[:3]) + (", …" if len(some) > 3 else "")

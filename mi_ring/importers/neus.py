@@ -18,7 +18,8 @@ from mi_ring.importers.reading import entry, first_file, image_size, matrix, num
 class Neus(Source):
     """IDR, NeuS, WildLight: cameras_sphere.npz or cameras.npz, folders image and mask. The light is at the camera.
 
-    SRC is the folder. WildLight's light_energy_* become intensities; its photographs without flash are left out.
+    SRC is the folder. WildLight's light_energy_* become light intensities. WildLight's photographs without flash are
+    left out.
     """
 
     fields = Fields(

@@ -25,10 +25,10 @@ TERMS = {
 
 @dataclass(frozen=True)
 class OpenSfm(Photogrammetry):
-    """OpenSfM, OpenDroneMap: reconstruction.json. The light is beside the camera.
+    """OpenSfM, OpenDroneMap: reconstruction.json. The light is fixed to the camera.
 
-    SRC is the file, or a folder with reconstruction.json or opensfm/reconstruction.json. Of several reconstructions the
-    one with the most photographs is taken.
+    SRC is the file, or a folder with reconstruction.json or opensfm/reconstruction.json. If the file has several
+    reconstructions, the one with the most photographs is used.
     """
 
     fields = Fields(
@@ -77,9 +77,10 @@ class OpenSfm(Photogrammetry):
 
 
 def opensfm_lens(given: dict[str, Any], image: Path, what: str) -> Lens:
-    """Make the lens of an OpenSfM camera from its JSON fields `given`.
+    """Make the lens of an OpenSfM camera. `given`: its JSON fields. `image`: a photograph that it took.
 
-    OpenSfM divides lengths by the longer side of the photograph, and measures positions from its centre.
+    OpenSfM divides lengths by the longer side of the photograph. It measures positions from the photograph's centre.
+    Raises InputError if the fields are invalid. The message begins with `what`.
     """
 
     def number(name: str, default: float | None = None) -> float:

@@ -1,4 +1,4 @@
-"""What photogrammetry formats have in common: ordinary photographs, taken with a light beside the camera."""
+"""Base class of photogrammetry formats: ordinary photographs, taken with a light that is fixed to the camera."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,10 @@ EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.
 
 @dataclass(frozen=True)
 class Photogrammetry(NamedPhotographs):
-    """Base class of the photogrammetry formats. Subclasses implement `posed`."""
+    """Base class of the photogrammetry formats. Subclasses implement `posed`.
+
+    The light is fixed to the camera. Its intensity follows the exposure of each photograph.
+    """
 
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the light relative to the lens: right, down and forward [scene units]. 0 0 0: at the lens.
@@ -38,9 +41,10 @@ class Photogrammetry(NamedPhotographs):
             yield frame
 
     def exposures(self, frames: Sequence[Frame]) -> np.ndarray:
-        """Relative exposures (N,) of the frames by EXIF data, divided by their median; 1 for all if EXIF has none.
+        """Return the relative exposures (N,) of the frames: those in the EXIF data, divided by their median.
 
-        Raises InputError if only some photographs have an exposure.
+        All are 1 if no photograph has an exposure in its EXIF data, or with --no-exif. Raises InputError if only some
+        photographs have one.
         """
         ones = np.ones(len(frames))
         if not self.exif:
@@ -57,15 +61,16 @@ class Photogrammetry(NamedPhotographs):
 
 
 def exif_values(path: Path) -> dict[int, Any]:
-    """Read exposure time, ISO and aperture from the EXIF data of an image file: values by tag."""
+    """Read exposure time, ISO and aperture from an image file. Returns a dict from EXIF tags to values."""
     exif = read_as(path, "image", exif_of).get_ifd(ExifTags.IFD.Exif)
     return {tag: exif[tag] for tag in EXPOSURE if tag in exif}
 
 
 def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
-    """Compute exposure time · ISO / aperture² of each photograph from its EXIF values by tag; NaN if unknown.
+    """Return the exposure of each photograph: exposure time · ISO / aperture². It is NaN if it is unknown.
 
-    A value that no photograph has, such as the aperture of an old lens, counts as equal in all.
+    `photographs`: for each, a dict from EXIF tags to values. If no photograph has one of the three, for example the
+    aperture of an old lens, this one is taken as 1 for all.
     """
     values = np.array([[positive(exif.get(tag)) for tag in EXPOSURE] for exif in photographs]).reshape(-1, 3)
     unknown = np.isnan(values).all(0)
@@ -78,7 +83,7 @@ def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
 
 
 def positive(value: Any) -> float:
-    """Convert an EXIF value to a positive float; NaN if it is anything else."""
+    """Convert an EXIF value to a float. Returns NaN if the value is not a positive finite number."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ArithmeticError, IndexError):

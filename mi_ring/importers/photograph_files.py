@@ -1,4 +1,4 @@
-"""Finds photographs and masks by the paths that files of other tools say."""
+"""Finds the files of photographs and masks by the paths that other tools have written."""
 
 import re
 import unicodedata
@@ -16,26 +16,29 @@ ASIDE = {*MASKS, "depth", "depths", "normal", "normals", "valid", "sparse"}
 
 
 def parts_of(path: str) -> list[str]:
-    """Split a path of any operating system into folders and file name, in lower case, without drive, `.` and `..`."""
+    """Split a path into its folders and its file name, in lower case. It works for paths of any operating system.
+
+    A drive letter, `.` and `..` are left out.
+    """
     parts = re.split(r"[/\\]+", unicodedata.normalize("NFC", path).casefold())
     return [part for part in parts if part not in ("", ".", "..") and not re.fullmatch("[a-z]:", part)]
 
 
 def name_of(path: str) -> str:
-    """Return the file name of a path of any operating system."""
+    """Return the file name of a path. It works for paths of any operating system."""
     return re.split(r"[/\\]+", path)[-1]
 
 
 def stem_of(name: str) -> str:
-    """Return a file name without its suffix, in lower case."""
+    """Return a file name without its suffix. `name` must be in lower case."""
     return SUFFIX.sub("", name)
 
 
 class PhotographFiles:
-    """Index of image files that finds the file for a path recorded by another tool, perhaps on another computer.
+    """Index of image files. It finds the file for a path that another tool has written, perhaps on another computer.
 
-    Case, suffix, drive and leading folders may differ. Among files with the same name, `find` takes the one whose
-    folders match the path.
+    The path and the file may differ in case, suffix, drive and leading folders. If several files have the same name,
+    `find` chooses the file whose folders match the path best.
     """
 
     def __init__(self, files: Iterable[Path], root: Path) -> None:
@@ -50,13 +53,13 @@ class PhotographFiles:
 
     @property
     def ordinary(self) -> list[Path]:
-        """The files that, by the names of their folders, are no masks, depth maps or the like."""
+        """The files outside folders of masks, depth maps and the like. Such folders are recognised by their names."""
         return [file for file in self.files if not ASIDE.intersection(self.folders[file][self.below :])]
 
     def find(self, path: str) -> tuple[Path | None, bool]:
-        """Find the file for a path. Returns (file or None, whether its folders below `root` match those of the path).
+        """Find the file for a path. Returns (file, whether its folders below `root` match those of the path).
 
-        Raises InputError if several files match equally well.
+        The file is None if no file matches. Raises InputError if several files match equally well.
         """
         if not (parts := parts_of(path)):
             return None, False
@@ -94,10 +97,11 @@ def refuse_twins(
     what: str = "photograph of two cameras",
     advice: str = "give --images, the folder that the paths of the cameras begin in",
 ) -> set[str]:
-    """Resolve claims of several paths to one file. Returns the paths that lose it to a path with matching folders.
+    """Decide which path gets a file that several paths claim. Returns the set of paths that get no file.
 
-    `claims`: tuples (file, path, whether their folders match). Raises InputError if two paths match a file equally
-    well; `what` (what the file would be) and `advice` are parts of the message.
+    `claims`: tuples (file, path, whether the folders of both match). A path with matching folders gets the file. Raises
+    InputError if this leaves more than one path. The message contains `what`, which says what the file would be, and
+    `advice`.
     """
     by_file: dict[Path, list[tuple[str, bool]]] = defaultdict(list)
     for file, path, agrees in claims:

@@ -20,10 +20,10 @@ USED = [*(f"t_{row}{column}" for row in range(3) for column in range(4)), "fx", 
 
 @dataclass(frozen=True)
 class Polycam(Photogrammetry):
-    """Polycam: raw data, exported in developer mode. The light is beside the camera.
+    """Polycam: raw data, exported in developer mode. The light is fixed to the camera.
 
-    SRC is the folder of the export, or its folder keyframes. The corrected cameras and images are taken, if there are
-    any. The camera looks along -z, y is up; y of the world is up.
+    SRC is the folder of the export, or its folder keyframes. If the export has corrected cameras and images, they are
+    used. A camera looks along its -z axis, and its y axis points up. In the world, y points up.
     """
 
     fields = Fields(
@@ -35,7 +35,7 @@ class Polycam(Photogrammetry):
 
     @property
     def corrected(self) -> str:
-        """What names of folders begin with: an empty text if the export has no corrected cameras."""
+        """Prefix of the folder names: "corrected_" if the export has corrected cameras, otherwise ""."""
         return "corrected_" if (self.keyframes / "corrected_cameras").is_dir() else ""
 
     @property

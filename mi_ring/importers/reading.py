@@ -1,4 +1,4 @@
-"""Readers of other tools' files. Each raises InputError for a missing, damaged or unexpected file."""
+"""Readers of other tools' files. Each raises InputError if the file is missing, damaged or of another kind."""
 
 import json
 import os
@@ -25,17 +25,20 @@ def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
 
 
 def pixels_of(path: Path, heed: bool = False) -> np.ndarray:
-    """Read the pixels (H, W, C) of an image file. `heed`: convert its colours, as in `images.read_image`."""
+    """Read the pixels (H, W, C) of an image file. `heed`: convert the colours, as `images.read_image` does."""
     return read_as(path, "image", lambda file: images.read_image(file, heed))
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Read the width and height [px] of an image file."""
+    """Return the width and height [px] of an image file."""
     return read_as(path, "image", image_headers.image_size)
 
 
 def orientation_of(path: Path) -> int:
-    """EXIF orientation by which pixels must be rotated after reading; 1 (none) if it is missing, and for raw files."""
+    """Return the EXIF orientation of an image file, 1 to 8: how its pixels must be turned after reading.
+
+    Returns 1 (not turned) if there is no such EXIF data. Also returns 1 for raw and HEIC files.
+    """
     if path.suffix.lower() in (*image_headers.HEIF, *image_headers.RAW):  # HEIF's reader has turned them already
         return 1
     value = read_as(path, "image", image_headers.exif_of).get(ExifTags.Base.Orientation)
@@ -43,7 +46,7 @@ def orientation_of(path: Path) -> int:
 
 
 def has_alpha(path: Path) -> bool:
-    """Test whether an image file has an alpha channel in which some pixel is not opaque."""
+    """Return whether an image file has an alpha channel in which at least one pixel is not opaque."""
     if not read_as(path, "image", image_headers.has_alpha_channel):
         return False
     pixels = pixels_of(path)
@@ -52,26 +55,35 @@ def has_alpha(path: Path) -> bool:
 
 
 def existing(path: Path, field: str) -> Path:
-    """Return `path`. Raises InputError if there is no such file; `field` names its origin in the message."""
+    """Return `path` if it is a file. Otherwise raises InputError. In the message, `field` says where `path` is from."""
     if not is_file(path):
         raise InputError(f"{path}: {field}: no such file")
     return path
 
 
 def first_file(candidates: list[Path], field: str) -> Path:
-    """Return the first of the candidates that exists. Raises InputError if none does; `field` begins the message."""
+    """Return the first candidate that is an existing file. Raises InputError if there is none.
+
+    The message begins with `field`.
+    """
     if file := next(filter(is_file, candidates), None):
         return file
     raise InputError(f"{field}: found neither {' nor '.join(map(str, candidates))}")
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List the image files in a folder, sorted by name. Hidden files are left out."""
+    """List the image files in a folder, sorted by name.
+
+    Hidden files are left out, and raw or HEIC files as in `without_raw_twins`.
+    """
     return without_raw_twins(path for path in folder.glob("[!.]*") if is_image(path))
 
 
 def images_below(folder: Path) -> list[Path]:
-    """List the image files in a folder and its subfolders, sorted. Hidden ones are left out."""
+    """List the image files in a folder and all its subfolders, sorted by path.
+
+    Hidden files and folders are left out, and raw or HEIC files as in `without_raw_twins`.
+    """
     found = []
     for place, inner, files in os.walk(folder):
         inner[:] = [name for name in inner if not name.startswith(".")]
@@ -80,12 +92,12 @@ def images_below(folder: Path) -> list[Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Test whether a path is an existing file with the suffix of an image format."""
+    """Return whether a path is an existing file with the suffix of an image format."""
     return path.suffix.lower() in image_headers.SUFFIXES and is_file(path)
 
 
 def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
-    """Sort the paths. Leaves out a raw or HEIC file if another format of the same photograph is beside it."""
+    """Sort the paths. Leaves out a raw or HEIC file if the same photograph is beside it in another format."""
     found = sorted(paths)
     twins = image_headers.RAW + image_headers.HEIF
     others = {path.with_suffix("") for path in found if path.suffix.lower() not in twins}
@@ -93,15 +105,18 @@ def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
-    """Return the image files in a folder by number: the number that is their name, else their index for all of them."""
+    """Return the image files in a folder: a dict from numbers to paths.
+
+    If all file names are numbers, these are the keys. Otherwise the keys are 0, 1, … in the order of the names.
+    """
     files = list_images(folder)
     return {int(f.stem): f for f in files} if all(f.stem.isdigit() for f in files) else dict(enumerate(files))
 
 
 def chosen(wanted: Collection[int], available: Collection[int], option: str, where: Path) -> list[int]:
-    """Return the `wanted` numbers, sorted, or all `available` ones if none is wanted.
+    """Return the `wanted` numbers, sorted. If `wanted` is empty, returns all `available` numbers.
 
-    Raises InputError, which names `option` and `where`, if a wanted number is not available.
+    Raises InputError if a wanted number is not available. The message names `option` and `where`.
     """
     for number in wanted:
         if number not in available:
@@ -110,9 +125,9 @@ def chosen(wanted: Collection[int], available: Collection[int], option: str, whe
 
 
 def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert `values` to an array of finite floats of this shape.
+    """Convert `values` to an array of floats of this `shape`.
 
-    Raises InputError if impossible; `what` begins it.
+    Raises InputError if `values` are not finite numbers of this shape. The message begins with `what`.
     """
     try:
         array = np.array(values, float)
@@ -128,17 +143,17 @@ def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def entry(arrays: Mapping[str, object], key: str, shape: tuple[int, ...], path: Path) -> np.ndarray:
-    """Return the array `key`, of this `shape`, from the content of a .mat or .npz file.
+    """Return the array `key`, which must be of this `shape`. `arrays`: the content of a .mat or .npz file.
 
-    Raises InputError, which names the file `path`, if it is missing or has another shape.
+    Raises InputError if the array is missing or has another shape. The message names the file `path`.
     """
     return matrix(arrays.get(key), shape, f"{path}: {key}")
 
 
 def load_mat(path: Path) -> dict:
-    """Read all variables of a MATLAB file.
+    """Read a MATLAB file. Returns a dict from names of variables to values.
 
-    A child process reads it first, because damaged files crash scipy's reader.
+    A child process reads the file first, because damaged files crash scipy's reader.
     """
     size = existing(path, "MATLAB file").stat().st_size
     require_readable("import scipy.io; scipy.io.loadmat(sys.argv[1])", path, size, "a MATLAB file")
@@ -151,7 +166,7 @@ def load_json(path: Path) -> Any:
 
 
 def require_object(value: Any, what: str) -> dict:
-    """Return `value` if it is a JSON object. Otherwise raises InputError; `what` begins the message."""
+    """Return `value` if it is a JSON object. Otherwise raises InputError. The message begins with `what`."""
     if not isinstance(value, dict):
         raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
     return value
@@ -163,7 +178,10 @@ def load_xml(path: Path) -> ElementTree.Element:
 
 
 def load_lines(path: Path, others: bool = False) -> list[str]:
-    """Read the lines of a text file, without empty ones. `others`: also accept UTF-16 and Windows' Latin-1."""
+    """Return the lines of a text file in UTF-8. Empty lines are left out.
+
+    `others`: also accept UTF-16 and the Windows code page 1252.
+    """
 
     def decoded(file: Path) -> str:
         content = file.read_bytes()
@@ -181,7 +199,7 @@ def load_lines(path: Path, others: bool = False) -> list[str]:
 
 
 def load_table(path: Path, columns: int) -> np.ndarray:
-    """Read the numbers (n, columns) in a text file."""
+    """Read a text file of numbers. Returns an array (n, `columns`)."""
     text = read_as(path, "table of numbers", lambda file: file.read_text("utf-8"))
     if not text.strip():
         raise InputError(f"{path}: is empty; must have {columns} numbers a line")

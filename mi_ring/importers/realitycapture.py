@@ -1,4 +1,4 @@
-"""RealityCapture's and RealityScan's cameras: XMP sidecars, or a table."""
+"""Cameras of RealityCapture and RealityScan: XMP sidecars, or a table."""
 
 import csv
 import re
@@ -28,10 +28,10 @@ BROWN = {"perspective": 0, "none": 0, "brown3": 3, "brown4": 4, "brown3t2": 6, "
 
 @dataclass(frozen=True)
 class RealityCapture(Photogrammetry):
-    """RealityCapture, RealityScan: XMP sidecars or the CSV table. The light is beside the camera.
+    """RealityCapture, RealityScan: XMP sidecars or the CSV table. The light is fixed to the camera.
 
-    SRC is the folder of the sidecars, or the file of the export "Internal/External camera parameters". The lens must
-    have one of the Brown models.
+    SRC is the folder of the sidecars, or the file of the export "Internal/External camera parameters". The distortion
+    model must be one of the Brown models.
     """
 
     fields = Fields(
@@ -58,7 +58,7 @@ class RealityCapture(Photogrammetry):
         return self.from_sidecars() if self.src.is_dir() else self.from_csv()
 
     def from_sidecars(self) -> Iterator[Frame]:
-        """Yield the photographs x.jpg beside which there is a sidecar x.xmp with a pose."""
+        """Yield the photographs that have a sidecar with a pose. The sidecar of x.jpg is x.xmp in the folder SRC."""
         if not any(self.src.glob("*.xmp")):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
@@ -99,7 +99,10 @@ class RealityCapture(Photogrammetry):
 
 
 def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
-    """Make the frame of a photograph from the `fields` of its XMP sidecar."""
+    """Make the frame of a photograph from the `fields` of its XMP sidecar, as `xmp_fields` returns them.
+
+    Raises InputError if a field is invalid. The message begins with `what`.
+    """
 
     def numbers(name: str, count: int, default: str | None = None) -> np.ndarray:
         text = fields.get(name, default)
@@ -123,7 +126,7 @@ def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
 
 
 def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
-    """Read RealityCapture's attributes and elements from an XMP file: text by name."""
+    """Return RealityCapture's attributes and elements in an XMP file: a dict from names to texts."""
     found: dict[str, str] = {}
     for element in root.iter():
         found |= {name: value for name, value in element.attrib.items() if name.startswith(XCR)}
@@ -133,9 +136,9 @@ def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
 
 
 def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Read a CSV file. Returns (column names, rows). A first line with the number of cameras is skipped.
+    """Read a CSV file. Returns (column names, rows). A line that begins with #cameras is skipped.
 
-    Accepts what spreadsheet programs write: semicolons or tabs, decimal commas, other encodings.
+    It also accepts what spreadsheet programs write: semicolons or tabs, decimal commas, other encodings than UTF-8.
     """
     lines = [line for line in load_lines(path, others=True) if not line.startswith("#cameras")]
     separator = max(",;\t", key=lines[0].count) if lines else ","
@@ -149,10 +152,10 @@ def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def film_lens(image: Path, focal: float, centre: list[float], terms: list[float], what: str) -> Lens:
-    """Make the lens of a photograph from lengths relative to the film.
+    """Make the lens of a photograph from the 35 mm equivalent `focal` length [mm].
 
-    `focal`: 35 mm equivalent focal length [mm]. `centre`: principal point relative to the centre of the photograph,
-    divided by its longer side. `terms`: the distortion coefficients `TERMS`.
+    `centre`: principal point relative to the centre of the photograph, divided by its longer side. `terms`: distortion
+    coefficients in the order of `TERMS`. Raises InputError if k4 is not 0. The message begins with `what`.
     """
     size = image_size(image)
     longer = max(size)

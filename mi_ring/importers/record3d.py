@@ -16,11 +16,11 @@ from mi_ring.importers.reading import list_images, load_json, matrix, require_ob
 
 @dataclass(frozen=True)
 class Record3D(Photogrammetry):
-    """Record3D: metadata.json beside a folder rgb. The light is beside the camera.
+    """Record3D: metadata.json beside a folder rgb. The light is fixed to the camera.
 
-    SRC is the folder. K is by columns. perFrameIntrinsicCoeffs are fx, fy, cx, cy of each photograph, if there are any.
-    poses are quaternions x y z w and positions, camera to world; the camera looks along -z, y is up. The names of the
-    photographs are the numbers of the poses.
+    SRC is the folder. The file of a photograph is named by its number, for example rgb/7.jpg. Pose number 7 in
+    metadata.json belongs to it. A pose is a quaternion x y z w and a position, camera-to-world. The camera looks along
+    its -z axis, and its y axis points up. The lens is perFrameIntrinsicCoeffs (fx, fy, cx, cy), or else K (by columns).
     """
 
     fields = Fields(

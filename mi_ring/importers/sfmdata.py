@@ -1,4 +1,4 @@
-"""Meshroom's (AliceVision's) and OpenMVG's scenes."""
+"""Scenes of Meshroom (AliceVision) and OpenMVG."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ COEFFICIENTS = ("disto_k1", "disto_k3", "disto_t2", "fisheye")  #: OpenMVG's fie
 
 @dataclass(frozen=True)
 class SfmData(Photogrammetry):
-    """Meshroom's cameras.sfm or sfm.json, OpenMVG's sfm_data.json. The light is beside the camera.
+    """Meshroom's cameras.sfm or sfm.json, OpenMVG's sfm_data.json. The light is fixed to the camera.
 
-    SRC is the file. It names the photographs; if they were moved, give --images.
+    SRC is the file. It names the photographs. If they were moved, give --images.
     """
 
     fields = Fields(
@@ -77,7 +77,7 @@ class SfmData(Photogrammetry):
         yield from self.openmvg(top) if "extrinsics" in top or "root_path" in top else self.alicevision(top)
 
     def alicevision(self, top: dict) -> Iterator[Frame]:
-        """Yield the photographs in a Meshroom file, whose top-level object is `top`."""
+        """Yield the photographs in a Meshroom file. `top`: its top-level JSON object."""
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
         poses = self.by_key(top, "poses", "poseId")
@@ -104,9 +104,10 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[Frame]:
-        """Yield the photographs in an OpenMVG file, whose top-level object is `top`.
+        """Yield the photographs in an OpenMVG file. `top`: its top-level JSON object.
 
-        Its library cereal names a polymorphic type only at the first use.
+        OpenMVG writes with the library cereal. It names a polymorphic type where it is first used, and later gives only
+        its number.
         """
         root = str(top.get("root_path", ""))
         intrinsics, types = self.by_key(top, "intrinsics", "key"), {}
@@ -133,41 +134,50 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, pose_of(R.T, center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
-        """Return the entries of the list `top[name]` by their field `key`; empty if there is no such list."""
+        """Return the entries of the list `top[name]`: a dict from the value of their field `key` to the entry.
+
+        The dict is empty if there is no such list.
+        """
         values = top.get(name) or []
         if not isinstance(values, list):
             raise InputError(f"{self.src}: {name}: must be a list")
         return {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[Frame]:
-        """Yield the frame of the photograph `file`, which may have moved; nothing if the photograph is not found."""
+        """Yield one frame, that of the photograph `file`. Yields nothing if no image file is found for it."""
         if own := self.photograph(file, what, relative=True):
             yield Frame(own, lens, pose, said=file)
 
 
 def file_name(view: dict, field: str, what: str) -> str:
-    """Return a view's file name from its `field`. Raises InputError if it is missing."""
+    """Return the file name in the `field` of a view. Raises InputError if it is missing.
+
+    The message begins with `what`.
+    """
     if not isinstance(view.get(field), str) or not view[field]:
         raise InputError(f"{what}: {field}: is missing; must be the name of a photograph")
     return view[field]
 
 
 def pointed_to(own: dict, what: str) -> dict:
-    """Return the object behind a smart pointer of cereal, together with the fields of its base class."""
+    """Return the object that a smart pointer of the library cereal holds, with the fields of its base class."""
     wrapper = require_object(require_object(own.get("value"), what).get("ptr_wrapper"), f"{what}: ptr_wrapper")
     data = require_object(wrapper.get("data"), f"{what}: data")
     return {**data.get("value0", {}), **data} if isinstance(data.get("value0", {}), dict) else data
 
 
 def type_number(value: dict, path: Path) -> int:
-    """Return the number of a polymorphic type of cereal, without the highest bit, which means that a name follows."""
+    """Return the number that the library cereal gives to the polymorphic type of `value`.
+
+    The highest bit is removed. It only says that a name follows. Raises InputError if there is no number.
+    """
     return int(matrix(value.get("polymorphic_id"), (), f"{path}: intrinsics: polymorphic_id")) & 0x7FFFFFFF
 
 
 def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
-    """Make a lens from AliceVision's fields. There, pixel centres are integers.
+    """Make a lens from AliceVision's fields `own`. In AliceVision, pixel centres are integers.
 
-    For the versions see sfmDataIO/CHANGES.md of AliceVision.
+    The meaning of the fields depends on the `version` of the file; see sfmDataIO/CHANGES.md of AliceVision.
     """
 
     def number(name: str, default: float | None = None) -> float:
@@ -195,7 +205,10 @@ def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
 
 
 def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
-    """Make a lens from OpenMVG's fields. There, pixel centres are integers. `kind`: name of the polymorphic type."""
+    """Make a lens from OpenMVG's fields `own`. In OpenMVG, pixel centres are integers.
+
+    `kind`: name of the polymorphic type. Raises InputError if the fields are invalid. The message begins with `what`.
+    """
     focal = float(matrix(own.get("focal_length"), (), f"{what}: focal_length"))
     centre = matrix(own.get("principal_point"), (2,), f"{what}: principal_point") + 0.5
     size = matrix([own.get("width"), own.get("height")], (2,), f"{what}: width, height")
@@ -204,9 +217,9 @@ def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
 
 
 def lens_of(size: np.ndarray, intrinsics: tuple, kind: str, given: Any, what: str) -> Lens:
-    """Make a lens with `intrinsics` fx, fy, cx, cy [px] and a distortion model `kind` of `MODELS`.
+    """Make a lens with `intrinsics` fx, fy, cx, cy [px] and the distortion model `kind`, a key of `MODELS`.
 
-    `given`: the model's coefficients; 0 if they are missing.
+    `given`: the coefficients of the model. If they are missing, they are 0.
     """
     if kind not in MODELS:
         raise InputError(f"{what}: the camera is of type {kind!r}; must be one of {', '.join(MODELS)}")

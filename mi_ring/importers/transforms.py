@@ -18,7 +18,7 @@ from mi_ring.importers.reading import image_size, images_below, load_json, matri
 
 @dataclass(frozen=True)
 class Transforms(NamedPhotographs):
-    """transforms.json of NeRF, instant-ngp, nerfstudio. pl_pos and pl_intensity of its frames are the lights.
+    """transforms.json of NeRF, instant-ngp, nerfstudio. The fields pl_pos and pl_intensity of a frame give its light.
 
     SRC is the file, or a folder with transforms.json or transforms_train.json.
     """
@@ -104,9 +104,10 @@ class Transforms(NamedPhotographs):
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
-    """Make the lens of a frame in transforms.json.
+    """Make the lens of a frame in transforms.json. `image`: its photograph.
 
-    `given`: the fields of the file, overridden by those of the frame.
+    `given`: the fields of the frame, and those fields of the file that the frame does not have. Raises InputError if a
+    field is invalid or not supported. The message begins with `where`.
     """
 
     def number(*names: str, default: float | None = None) -> float:

@@ -13,7 +13,7 @@ AT_ONCE = 2**22  #: pixels; interpolating them takes about half a gigabyte
 
 
 class Window(NamedTuple):
-    """A rectangular part of the undistorted photograph, and the scale at which to compute it."""
+    """A rectangle of the undistorted photograph, and the scale at which it is computed."""
 
     left: int  #: first column [px of the photograph]
     top: int  #: first row [px of the photograph]
@@ -23,14 +23,14 @@ class Window(NamedTuple):
 
     @classmethod
     def whole(cls, lens: Lens, longest: int) -> "Window":
-        """Make a window of the whole photograph, reduced so that its longer side has at most `longest` pixels."""
+        """Return a window of the whole photograph. Its scale makes its longer side at most `longest` pixels long."""
         scale = -(-max(lens.size) // longest)
         return cls(0, 0, lens.size[0] // scale, lens.size[1] // scale, scale)
 
 
 @lru_cache(maxsize=1)
 def source_positions(lens: Lens, window: Window) -> np.ndarray:
-    """Map each pixel of the window to its position in the distorted photograph: rows and columns (2, H, W) [px].
+    """Return the position of each pixel of the window in the distorted photograph: rows and columns (2, H, W) [px].
 
     The centre of the first pixel is at 0.
     """
@@ -45,12 +45,12 @@ def source_positions(lens: Lens, window: Window) -> np.ndarray:
 def undistort(
     pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: float = 1.0, window: Window | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Undistort an image (H, W, C).
+    """Remove the lens distortion of an image (H, W, C). Returns (image (H, W, C), valid pixels (H, W) bool).
 
-    Returns (pinhole image (H, W, C) with the same intrinsics, valid pixels (H, W) bool). Linear radiance is
-    interpolated. Pixels outside the source image are 0 and invalid. `srgb`: are the first three channels sRGB-encoded?
-    `saturation`: encoded value (1 = full scale) from which a pixel is clipped; infinite for masks. A result is clipped
-    if any pixel that contributes to it is. `window`: the part to compute, of scale 1; None: all.
+    The result is the image of a pinhole camera with the same intrinsics. Pixels outside the source image are 0 and
+    invalid. `srgb`: the first three channels are sRGB-encoded; they are interpolated as linear values. `saturation`:
+    encoded value (1 = full scale) from which a pixel is clipped; infinite for masks. A pixel of the result is clipped
+    if any pixel that contributes to it is clipped. `window`: the part to compute, with scale 1; None: the whole image.
     """
     window = window or Window(0, 0, *lens.size)
     rows = max(1, AT_ONCE // window.width)
@@ -64,7 +64,7 @@ def undistort(
 def undistort_part(
     pixels: np.ndarray, lens: Lens, srgb: bool, saturation: float, window: Window
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Undistort a window that is small enough for arrays of floats; see `undistort`."""
+    """Do the work of `undistort` for one window. The window must be small, because its arrays are of floats."""
     positions = source_positions(lens, window)
     size = np.array(pixels.shape[:2])
     valid = np.all((positions >= -0.5) & (positions <= size[:, None, None] - 0.5), 0)

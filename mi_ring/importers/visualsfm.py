@@ -22,10 +22,10 @@ MAX_ERROR = 0.01  #: of the approximant in the corner of a photograph [px]
 
 @dataclass(frozen=True)
 class VisualSfm(Photogrammetry):
-    """VisualSFM: .nvm, version NVM_V3. The light is beside the camera.
+    """VisualSFM: .nvm, version NVM_V3. The light is fixed to the camera.
 
-    SRC is the file. Of several models the one with the most photographs is taken. The file gives no sizes: the
-    photographs must have their original size.
+    SRC is the file. If it has several models, the one with the most photographs is used. The file does not give the
+    size of the photographs. They must have their original size.
     """
 
     fields = Fields(
@@ -65,9 +65,9 @@ class VisualSfm(Photogrammetry):
                 yield Frame(image, lens, pose_of(R.T, np.array([x, y, z])), said=name)
 
     def models(self, lines: list[str]) -> list[list[str]]:
-        """Split the lines of the file by model, and return the camera lines of each.
+        """Split the `lines` of the file into models. Returns the lines of the cameras for each model.
 
-        A model consists of a number of cameras and as many lines, then a number of points and as many lines.
+        A model is the number of cameras, a line for each camera, the number of points, and a line for each point.
         """
         models, at = [], 0
 
@@ -89,8 +89,8 @@ class VisualSfm(Photogrammetry):
 def undistorting_lens(size: tuple[int, int], intrinsics: tuple[float, ...], r: float, what: str) -> Lens:
     """Make a lens that approximates VisualSFM's radial distortion `r`. `size`: (width, height) [px].
 
-    `intrinsics`: fx, fy, cx, cy [px]. Raises InputError if the distortion is too strong for the approximation; `what`
-    begins the message.
+    `intrinsics`: fx, fy, cx, cy [px]. Raises InputError if the distortion is too strong for the approximation. The
+    message begins with `what`.
     """
     if not r:
         return Lens("PINHOLE", size, intrinsics)

@@ -1,4 +1,4 @@
-"""Writes a scene file with its images, all or nothing."""
+"""Writes a scene file and its images. After an error, none of them exists."""
 
 import contextlib
 import filecmp
@@ -24,7 +24,7 @@ from mi_ring.system.files import relative_to, write_file
 
 
 class Writer:
-    """Collects the files of a scene in a temporary folder. `finish` moves them to their places."""
+    """Writes the files of a scene into a temporary folder. `finish` moves them to their final places."""
 
     def __init__(self, scene: Path) -> None:
         self.scene = scene
@@ -37,7 +37,7 @@ class Writer:
         self.shared: dict = {}  #: relative paths of files that several photographs share, by folder and key
 
     def write(self, file: str, write: Callable[[Path], object]) -> Path:
-        """Call `write(path)` to write a file into the temporary folder. Returns the path that the file will have."""
+        """Call `write` with the path of `file` in the temporary folder. Returns the final path of the file."""
         path = self.staging / file
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path)
@@ -45,22 +45,22 @@ class Writer:
         return self.folder / file
 
     def image(self, file: str, pixels: np.ndarray) -> Path:
-        """Write an image; `file`: its name without suffix. float32 becomes EXR, all else PNG.
+        """Write an image into the temporary folder: float32 as EXR, other types as PNG. Returns its final path.
 
-        Returns the final path.
+        `file`: name of the file without suffix.
         """
         suffix = ".exr" if pixels.dtype == np.float32 else ".png"
         return self.write(file + suffix, lambda path: write_image(pixels, path))
 
     def relative(self, path: Path) -> Path:
-        """Convert a path to one relative to the scene file."""
+        """Return `path` relative to the folder of the scene file."""
         return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
-        """Move all files to their final places, then write the scene file.
+        """Move all files to their final places. Then write the scene file with the content `xml`.
 
-        Raises InputError if a different file is already there, because it may be a source. An identical file is left by
-        an interrupted run, and is accepted.
+        Raises InputError if another file is already at such a place, because it may be a source. A file with the same
+        content is accepted. It may come from an interrupted run.
         """
         for file in self.files:
             place = self.folder / file
@@ -72,7 +72,7 @@ class Writer:
         write_file(self.scene, xml)
 
     def close(self) -> None:
-        """Remove the temporary folder, and folders that this writer made and left empty."""
+        """Remove the temporary folder. Also remove folders that this writer created and that are empty."""
         shutil.rmtree(self.staging, ignore_errors=True)
         for folder in self.new_folders:
             with contextlib.suppress(OSError):  # not empty
@@ -80,9 +80,10 @@ class Writer:
 
 
 def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
-    """Write the files of a frame that had to change; with `copy` all of them.
+    """Write the image, mask and valid pixels of a frame, if they must change.
 
-    Returns their names for the scene file.
+    `copy`: also copy the files that need not change. `name`: name of the files without suffix. Returns the paths of all
+    files for the scene file.
     """
     straight, pixels, turn = frame.lens.is_pinhole, frame.pixels, frame.orientation
 
