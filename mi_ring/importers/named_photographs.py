@@ -48,7 +48,7 @@ class NamedPhotographs(Source):
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs: `images` if given, else a folder named images near the camera file, or `beside`."""
+        """Folder of the photographs: `images` if given, else a folder images near the camera file, or `beside`."""
         candidates = (self.beside / "images", self.beside.parent / "images")
         return self.images or next((folder for folder in candidates if folder.is_dir()), self.beside)
 
