@@ -1,4 +1,4 @@
-"""Checks the arguments of `Capture.from_arrays`, and writes them as files."""
+"""Checks the arguments of `Capture.from_arrays`, and writes the arrays to files."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -28,9 +28,9 @@ Item = TypeVar("Item")
 
 
 def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarray]:
-    """Check photographs and return them as arrays (H, W, 3).
+    """Check photographs, and return them as arrays (H, W, 3).
 
-    Raises InputError if the list is empty or one is invalid.
+    Raises InputError if there are none, or if one is invalid.
     """
     if encoding not in ("auto", "srgb", "linear"):
         raise InputError(f"encoding: is {encoding!r}, must be one of auto, srgb, linear")
@@ -41,9 +41,9 @@ def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarra
 
 
 def masks_of(masks: Iterable[ArrayLike | None] | None, images: Sequence[np.ndarray], what: str) -> Pixels:
-    """Check the masks of `images` and return them as uint8 arrays (H, W), 255 on the object.
+    """Check the masks of `images`, and return them as uint8 arrays (H, W), 255 on the object.
 
-    Raises InputError if one is invalid; `what` begins the message.
+    Raises InputError if a mask is invalid. The message begins with `what`.
     """
     several = zip(one_each(masks, len(images), what), images)
     return Pixels.of([mask_of(mask, image, f"{what}[{k}]") for k, (mask, image) in enumerate(several)])
@@ -53,7 +53,10 @@ def shots_of(
     images: Sequence[np.ndarray], cameras: Iterable[Camera], lights: Iterable[Light | None] | None,
     names: Sequence[str] | None, encoding: Encoding, saturation: float, calibrated: bool,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """Make the `Shot` of each image. Arguments: as for `Capture.from_arrays`. Raises InputError if one is invalid."""
+    """Make a `Shot` for each image. The arguments are those of `Capture.from_arrays`.
+
+    Raises InputError if an argument is invalid.
+    """
     count = len(images)
     full = float(numbers(saturation, (), "saturation"))
     if not full > 0:
@@ -67,9 +70,9 @@ def shots_of(
 
 
 def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item | None]:
-    """Return one item per photograph; a list of None if `items` is None.
+    """Return `items` as a list, one for each photograph. If `items` is None, all items of the list are None.
 
-    Raises InputError unless there are `count` items.
+    Raises InputError if there are not `count` items. The message begins with `what`.
     """
     found: list[Item | None] = [None] * count if items is None else list(items)
     if len(found) != count:
@@ -78,9 +81,9 @@ def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item |
 
 
 def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
-    """Check a photograph and return it as an array (H, W, 3).
+    """Check a photograph, and return it as an array (H, W, 3).
 
-    Raises InputError if invalid; `what` begins the message.
+    Raises InputError if it is invalid. The message begins with `what`.
     """
     array = np.asarray(image)
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 3 or array.shape[2] != 3 or not array.size:
@@ -96,9 +99,9 @@ def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
 
 
 def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray | None:
-    """Check a mask and return it as an array (H, W) uint8, 255 inside; None stays None.
+    """Check a mask, and return it as an array (H, W) uint8, 255 on the object. If `mask` is None, return None.
 
-    Raises InputError if it is invalid or differs in size from `image`; `what` begins the message.
+    Raises InputError if the mask is invalid, or if its size is not that of `image`. The message begins with `what`.
     """
     if mask is None:
         return None
@@ -112,7 +115,10 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
 
 
 def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
-    """Check the camera of an image and round its numbers to float32. Raises InputError; `what` begins the message."""
+    """Check the camera of an image. Returns the camera with its numbers rounded to float32.
+
+    Raises InputError if the camera is invalid, or if its size is not that of the image. The message begins with `what`.
+    """
     if not isinstance(camera, Camera):
         raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
     to_world, focal, centre, distortion = (
@@ -133,7 +139,10 @@ def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
 
 
 def light_of(light: object, what: str) -> Light | None:
-    """Check a light and round its numbers to float32; None stays None. Raises InputError; `what` begins the message."""
+    """Check a light. Returns the light with its numbers rounded to float32. If `light` is None, returns None.
+
+    Raises InputError if the light is invalid. The message begins with `what`.
+    """
     if light is None:
         return None
     if not isinstance(light, Light) or light.kind not in ("point", "directional"):
@@ -146,9 +155,9 @@ def light_of(light: object, what: str) -> Light | None:
 
 
 def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert a value to a float32 array of this shape.
+    """Convert a value to a float32 array of this `shape`.
 
-    Raises InputError, which begins with `what`, if that is impossible.
+    Raises InputError if this is impossible, or if a number is not finite or too large. The message begins with `what`.
     """
     try:
         array = np.asarray(value, float)
@@ -162,9 +171,9 @@ def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def names_of(names: Sequence[str] | None, count: int) -> list[str]:
-    """Check the names of `count` photographs; None gives 000, 001, ….
+    """Check the names of `count` photographs, and return them. If `names` is None, return 000, 001, ….
 
-    Raises InputError if one is invalid or repeated.
+    Raises InputError if a name is invalid or occurs twice.
     """
     if names is None:
         return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
@@ -177,7 +186,10 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
 
 
 def room_of(room: ArrayLike) -> np.ndarray:
-    """Pad spherical harmonics (n, 3) of a room's light with zeros to (BASIS, 3). Raises InputError for a wrong n."""
+    """Return the spherical harmonics (n, 3) of a room's light as an array (BASIS, 3). Missing rows are 0.
+
+    Raises InputError if n is not the number of harmonics up to an order.
+    """
     array, counts = np.asarray(room, float), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
     if array.ndim != 2 or array.shape[0] not in counts:
         raise InputError(f"room: is of shape {array.shape}; must be (n, 3), n one of {', '.join(map(str, counts))}")
@@ -186,14 +198,15 @@ def room_of(room: ArrayLike) -> np.ndarray:
 
 
 def sides(image: np.ndarray) -> str:
-    """Format the width and height of an image (H, W, …) for messages."""
+    """Return the width and height of an image (H, W, …) as text for a message."""
     return "{} x {}".format(*image.shape[1::-1])
 
 
 def files_of(shot: Shot, image: np.ndarray, masked: bool, valid: bool) -> Files:
-    """Choose file names for a photograph and its masks, relative to the scene file: EXR for float32, PNG for all else.
+    """Return the names of the files of a photograph and its masks, relative to the scene file. No file is written.
 
-    `masked`, `valid`: does the photograph have a mask, and a mask of valid pixels?
+    An image of float32 gets the suffix exr, everything else png. `masked`: does the photograph have a mask? `valid`:
+    does it have a mask of valid pixels?
     """
     suffix = "exr" if image.dtype == np.float32 else "png"
     mask, shown = (Path(folder, f"{shot.name}.png") if there else None
@@ -205,7 +218,10 @@ def scene_xml(
     shots: Sequence[Shot], files: Sequence[Files], center: ArrayLike | None, radius: float | None,
     room: ArrayLike | None,
 ) -> bytes:  # fmt: skip
-    """Make the content of the scene file for `Capture.from_arrays`. Raises InputError for an invalid argument."""
+    """Return the content of the scene file for a capture from arrays. `files`: names relative to the scene file.
+
+    The other arguments are those of `Capture.from_arrays`. Raises InputError if one is invalid.
+    """
     middle = None if center is None else numbers(center, (3,), "center")
     reach = None if radius is None else float(numbers(radius, (), "radius"))
     if reach is not None and not reach > 0:
@@ -217,7 +233,10 @@ def scene_xml(
 
 
 def write_array(array: np.ndarray, file: Path) -> None:
-    """Write a photograph (H, W, 3) or a mask (H, W) to `file`, and make its folder. Raises InputError if this fails."""
+    """Write a photograph (H, W, 3) or a mask (H, W) to `file`. If the folder does not exist, it is created.
+
+    Raises InputError if this fails.
+    """
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
     write_image(array if array.ndim == 3 else array[..., None], file)

@@ -1,4 +1,4 @@
-"""Masks by brightness, for photographs in a dark room without given masks."""
+"""Makes masks from brightness, for photographs of a dark room that have no masks."""
 
 from dataclasses import replace
 from functools import partial
@@ -14,9 +14,10 @@ from mi_ring.images import box_filter
 
 
 def with_masks_by_brightness(capture: Capture) -> Capture:
-    """Return the capture with masks of all pixels brighter than `dark_threshold`. If the room was lit, nothing changes.
+    """Return the capture with new masks: all pixels brighter than `dark_threshold`. They replace the old masks.
 
-    Such a mask contains the lit part of the object. The shadowed part may be as dark as the room.
+    If the room was lit, the same capture is returned. A mask contains only the lit part of the object, because its
+    shadowed part may be as dark as the room. A photograph in which no light reaches the object gets no mask.
     """
     threshold = dark_threshold(capture)
     if threshold is None:
@@ -29,7 +30,7 @@ def with_masks_by_brightness(capture: Capture) -> Capture:
 
 
 def dark_threshold(capture: Capture) -> float | None:
-    """Estimate the radiance below which a pixel may show the dark room. None if the room was lit."""
+    """Estimate the radiance below which a pixel may show the dark room. Returns None if the room was lit."""
     some = [small_brightness(capture, k) for k in capture.spread(50)]
     values = np.concatenate([image.ravel() for image in some])
     if values.max() <= 0:
@@ -47,18 +48,18 @@ def dark_threshold(capture: Capture) -> float | None:
 
 
 def bright(capture: Capture, k: int, threshold: float) -> np.ndarray:
-    """Make a mask (H, W) uint8 of photograph `k`: 255 where brighter than `threshold`, else 0.
+    """Return a mask (H, W) uint8 of photograph `k`: 255 where it is brighter than `threshold`, else 0.
 
-    Small pieces are left out.
+    Connected components are left out if they are smaller than 1 % of the largest one.
     """
     labels, sizes = pieces(brightness(capture, k) > threshold)
     return np.where(sizes[labels] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
 
 
 def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find connected components of a mask (...) bool. Returns (labels (...), component sizes by label).
+    """Find the connected components of a mask (...) bool. Returns (labels (...), number of pixels by label).
 
-    Label 0 is the background; its size is given as 0.
+    Label 0 is the background. Its number of pixels is set to 0.
     """
     labels, _ = scipy.ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
@@ -67,12 +68,15 @@ def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_brightness(capture: Capture, k: int) -> np.ndarray:
-    """Return `brightness` of photograph `k`, reduced by block means to a shorter side of at least 256 pixels."""
+    """Return `brightness` of photograph `k`, reduced by block means. The shorter side keeps at least 256 pixels.
+
+    A smaller photograph is not reduced.
+    """
     image = torch.from_numpy(brightness(capture, k))[..., None]
     return box_filter(image, max(1, min(image.shape[:2]) // 256))[..., 0].numpy()
 
 
 def brightness(capture: Capture, k: int) -> np.ndarray:
-    """Return radiance (H, W) of photograph `k`: the maximum over colour channels at each pixel."""
+    """Return the brightness (H, W) of photograph `k`: the largest linear radiance of the three colour channels."""
     image = capture.images[k]
     return decode(image, is_linear(capture.shots[k].encoding, image), 1.0)[0].max(-1)

@@ -36,7 +36,7 @@ LIT = 0.01  #: a room is lit if the background is brighter than this [brightness
 
 
 def require_variant(what: str | Path) -> None:
-    """Raise InputError if the current Mitsuba variant cannot be used for fits; `what` begins the message."""
+    """Raise InputError if the current Mitsuba variant cannot be used for fits. The message begins with `what`."""
     if mi.variant() not in ("llvm_ad_rgb", "cuda_ad_rgb"):
         why = llvm.missing() or "call mi.set_variant('llvm_ad_rgb') first"
         raise InputError(f"{what}: needs the variant llvm_ad_rgb or cuda_ad_rgb of Mitsuba, not {mi.variant()}; {why}")
@@ -46,8 +46,8 @@ def require_variant(what: str | Path) -> None:
 class Capture:
     """Photographs with their masks, cameras and lights, and the scene that they show: the input of a fit.
 
-    `mi_ring.load_capture` reads one from a scene file, `from_arrays` makes one from arrays. It is immutable; use
-    `dataclasses.replace` for one with changed fields, for instance other `shots`.
+    `mi_ring.load_capture` reads a capture from a scene file. `from_arrays` makes one from arrays. A capture is
+    immutable. To change a field, for example `shots`, make a new capture with `dataclasses.replace`.
     """
 
     path: Path  #: the scene file; for a capture from arrays its name
@@ -73,30 +73,32 @@ class Capture:
         center: ArrayLike | None = None, radius: float | None = None, room: ArrayLike | None = None,
         encoding: Encoding = "auto", saturation: float = 1.0, calibrated: bool = False, name: str = "capture",
     ) -> "Capture":  # fmt: skip
-        """A capture of photographs in arrays, without files. The object's BSDF is `cooktorrance`. ::
+        """Make a capture from photographs in arrays. No file is read. The object's BSDF is `cooktorrance`. ::
 
             camera = mi_ring.Camera(to_world, focal, centre, (width, height))
             light = mi_ring.Light("point", position, intensity)
             capture = mi_ring.Capture.from_arrays(images, masks, cameras=cameras, lights=lights)
 
-        `images`: N arrays (H, W, 3), which may differ in size. uint8 is sRGB; uint16 and float32 are linear, unless
-        `encoding` is "srgb". 1.0, or the largest integer, is full scale. `saturation`: encoded value (1 = full scale)
+        `images`: N arrays (H, W, 3). Their sizes may differ. uint8 is sRGB. uint16 and float32 are linear, unless
+        `encoding` is "srgb". Full scale is 1.0 or the largest integer. `saturation`: encoded value (1 = full scale)
         from which a pixel is clipped. Arrays are not copied.
 
-        `masks`, `valid`: N arrays (H, W) of bool or of uint8 from 0 to 255, or None for a photograph without one. In a
-        mask, 255 is the object. Where `valid` is 0, a pixel is ignored. Default: none.
+        `masks`, `valid`: N arrays (H, W) of bool, or of uint8 from 0 to 255, or None for a photograph without one. In a
+        mask, 255 is the object. Where `valid` is 0, a pixel is ignored. By default, no photograph has a mask, and all
+        pixels are valid.
 
-        `cameras`: N `Camera`, whose `size` is that of the image. `lights`: N `Light`, each for its own photograph; None
-        is a point light of intensity 1 at the camera. Lengths are in scene units.
+        `cameras`: N `Camera`. The `size` of each is that of the image. `lights`: N `Light`. Each lights only its own
+        photograph. None stands for a point light of intensity 1 at the camera. Lengths are in scene units.
 
         `names`: N different names of photographs. Default: 000, 001, …. `center` (3,), `radius`: sphere around the
-        object [scene units]. Default: estimated from masks or cameras. `room` (n, 3): light of the room in all
+        object [scene units]. By default, it is estimated from masks or cameras. `room` (n, 3): light of the room in all
         photographs, as R, G, B of radiance in the first n real spherical harmonics, in world axes; n is 1, 4, 9, 16 or
-        25. `calibrated`: are cameras and lights exact? `name`: of the capture, for error messages and reports.
+        25. `calibrated`: True says that cameras and lights are exact. `name`: name of the capture, for error messages
+        and reports.
 
-        Everything else that a scene file can say about a photograph is a field of `Shot`: `replace` the `shots`.
+        A scene file can say more about a photograph. For this, change fields of its `Shot`, and `replace` the `shots`.
 
-        Raises InputError, which names the argument, for input that cannot be fitted.
+        Raises InputError if the input cannot be fitted. The message names the argument.
         """
         require_variant(name)
         pictures = arrays.images_of(images, encoding)
@@ -115,14 +117,14 @@ class Capture:
 
     @property
     def in_memory(self) -> bool:
-        """Test whether the photographs are arrays in memory, without files."""
+        """True if the photographs are arrays in memory, without files."""
         return any(shot.files.filename is None for shot in self.shots)
 
     def save(self, path: str | Path) -> "Capture":
-        """Write a capture from arrays as the scene file `path`, with its photographs and masks beside it.
+        """Write a capture from arrays as the scene file `path`. Its photographs and masks are written beside it.
 
-        Returns the capture with these files. Raises InputError if they cannot be written, or if the capture already has
-        a scene file.
+        Returns a capture that refers to these files. Raises InputError if they cannot be written, or if the capture
+        already has a scene file.
         """
         path = Path(path)
         if not self.in_memory:
@@ -142,21 +144,21 @@ class Capture:
 
     @functools.cached_property
     def photographs(self) -> Photographs:
-        """Cameras, lights and room light of all photographs, for the renderer.
+        """Cameras, lights and room light of all photographs, as the renderer takes them.
 
-        Raises SceneError for unsupported lights.
+        Raises SceneError if a light is not supported.
         """
         return Photographs.of(self.shots, self.room)
 
     @functools.cached_property
     def sizes(self) -> dict[tuple[int, int], np.ndarray]:
-        """Indices of the photographs by image size (width, height) [px], because one launch renders one size."""
+        """Indices of the photographs by image size (width, height) [px]. One launch renders photographs of one size."""
         sizes = [shot.size for shot in self.shots]
         return {size: np.array([k for k, other in enumerate(sizes) if other == size]) for size in dict.fromkeys(sizes)}
 
     @property
     def known(self) -> bool:
-        """Test whether the scene declares all cameras and lights to be exact."""
+        """True if the scene says that all cameras and lights are exact."""
         return all(shot.calibrated for shot in self.shots)
 
     def __len__(self) -> int:
@@ -164,7 +166,7 @@ class Capture:
 
     @functools.cached_property
     def names(self) -> list[str]:
-        """File name of each photograph; with folders if file names are not unique."""
+        """File name of each photograph. If two have the same file name, all names contain folders."""
         files = [Path(os.path.abspath(shot.files.filename or shot.name)) for shot in self.shots]
         names = [file.name for file in files]
         if len(set(names)) == len(names):
@@ -181,9 +183,9 @@ class Capture:
         return replace(self, shots=tuple(self.shots[k] for k in index), **pixels)
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Capture":
-        """Transform cameras and lights to another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
+        """Return a capture with transformed cameras and lights: x ↦ scale · rotation (3, 3) x + shift (3,).
 
-        Use it for small motions: the rest of the scene (room light, table, lamps) does not move.
+        Use it for small motions only, because the rest of the scene (room light, table, lamps) does not move.
         """
         return replace(self, shots=tuple(shot.moved(scale, rotation, shift) for shot in self.shots))
 
@@ -192,31 +194,35 @@ class Capture:
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Split the photographs `index` into groups of one size, at most `most` each, to render in one launch."""
+        """Split the photographs `index` into groups of one size, at most `most` each. Yields the indices of a group."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
                 yield chosen[start : start + most]
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
-        """Return photograph `k` for the renderer, at 1 / `scale` of its size."""
+        """Return camera and lights of photograph `k` for the renderer, at 1 / `scale` of its size."""
         return self.selected([k], scale)
 
     def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
-        """Return the photographs `index`, all of one size, for the renderer, at 1 / `scale` of this size."""
+        """Return cameras and lights of the photographs `index` for the renderer. The photographs must be of one size.
+
+        They are at 1 / `scale` of this size.
+        """
         return self.photographs.select(index, self.shots[index[0]].size, scale)
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
-        """Read the pixels of photographs `index`, all of one size, reduced `scale` times by a box filter."""
+        """Read the pixels of the photographs `index`, all of one size, reduced by the factor `scale` (box filter)."""
         return Observation.joined([self._observed.get(k, scale, partial(self._observe, k, scale)) for k in index])
 
     def _observe(self, k: int, scale: int) -> Observation:
         return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
     def exposure(self) -> float:
-        """Mean linear radiance of the object's pixels. Without masks: of pixels above 2 % of the photograph's maximum.
+        """Return the mean linear radiance of the object's pixels, estimated from `SOME` photographs.
 
-        It is estimated from `SOME` photographs. Raises InputError if all these pixels are black.
+        Without a mask, these are the pixels above 2 % of the photograph's maximum. Raises InputError if all of them are
+        black.
         """
         total, count = 0.0, 0
         for k in self.spread(SOME):
@@ -230,10 +236,7 @@ class Capture:
 
     @functools.cached_property
     def lit_room(self) -> bool:
-        """Test whether pixels outside the masks are lit.
-
-        In a dark room, black pixels show that the object is not there.
-        """
+        """True if pixels outside the masks are lit. If not, a black pixel shows that the object is not there."""
         shares = []
         for k in self.spread(SOME):
             rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.shots[k].size) // COARSE))
@@ -245,27 +248,24 @@ class Capture:
         return bool(shares) and float(np.median(shares)) > LIT
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
-        """Estimate the reflectance of a surface at `center` (3,) whose mean radiance in the photographs is `exposure`.
+        """Estimate the reflectance, radiance / irradiance, of a surface at `center` (3,).
 
-        It is ALBEDO / π if no known light reaches the surface.
+        `exposure`: mean radiance of the surface. If no known light reaches it, returns ALBEDO / π.
         """
         received = float(np.median(self.photographs.irradiance(center).mean(1)))
         return exposure / received if received > 0 else ALBEDO / math.pi
 
     @property
     def up(self) -> np.ndarray:
-        """Mean up direction (3,) of the cameras, unit length.
-
-        If the up directions cancel out, that of the first camera.
-        """
+        """Mean up direction (3,) of the cameras, of length 1. If they cancel out, that of the first camera."""
         ups = np.stack([shot.camera.up for shot in self.shots])
         up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
         return up / np.linalg.norm(up)
 
     def silhouettes(self, most: int | None = None) -> list[Silhouette]:
-        """Return reduced masks with their cameras, without duplicates.
+        """Return the masks of the photographs with their cameras, reduced in size. Equal pairs occur once.
 
-        `most`: largest number, evenly spaced; None: all.
+        `most`: largest number of them, evenly spaced. None: all.
         """
         return [
             small_silhouette(Silhouette(
@@ -285,12 +285,12 @@ class Capture:
 
     @property
     def views(self) -> list[MaskedCamera]:
-        """The camera of each photograph, paired with the mask of valid pixels."""
+        """Camera of each photograph, with the mask of valid pixels, both reduced in size."""
         return views_of(self.shots, self.valid)
 
     @property
     def hull(self) -> Hull | None:
-        """Visual hull of the masks. None if there are no masks, or if all are from one side."""
+        """Visual hull of the masks. It is None if there are no masks, or if all show the object from one side."""
         index, wrong = self._outlined(MAX_MASKS), 0.02 if self.whole else 0.25
         key = wrong, *((self.masks.readers[k], self.valid.readers[k], self.shots[k].camera.key) for k in index)
         if key not in self.hulls:
@@ -302,18 +302,15 @@ class Capture:
 
     @property
     def whole(self) -> bool:
-        """Test whether the masks contain the whole object. Masks by brightness do not: they lack its shadowed part."""
+        """True if the masks contain the whole object. Masks by brightness may lack the part in shadow."""
         return self.threshold is None or (self.photographs.colocated and not self.photographs.dark)
 
     def outline(self, k: int) -> str:
-        """Return the name of the file that contains the mask of photograph `k`, for messages."""
+        """Return the name of the file that contains the mask of photograph `k`. It is for messages."""
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
-        """Return (centre (3,), radius) of the normalising sphere [scene units].
-
-        They are given in the XML or estimated.
-        """
+        """Return (centre (3,), radius) of the normalising sphere [scene units]: from the scene file, else estimated."""
         center, radius = self.shape.center, self.shape.radius
         if center is None or radius is None:
             if self.hull:
@@ -326,7 +323,7 @@ class Capture:
 
 
 def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
-    """Pair the cameras of photographs with their valid pixels, both reduced to at most `MAX_WIDTH`."""
+    """Return the camera of each photograph, with the mask of valid pixels. Both are reduced to `MAX_WIDTH` or less."""
     small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
     for k, reader in enumerate(valid.readers):
         if reader not in small:
@@ -338,8 +335,8 @@ def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
     """Estimate a sphere around the object from the cameras alone. Returns (centre (3,), radius) [scene units].
 
-    The centre is the point nearest to all optical axes. The radius is half that of the largest ball around it that all
-    photographs contain.
+    The centre is the point nearest to all optical axes. Around it, take the largest ball that lies completely in the
+    view of every camera. The radius is half that of this ball.
     """
     cameras = [shot.whole.camera for shot in capture.shots]
     origins = np.stack([camera.position for camera in cameras])

@@ -21,7 +21,7 @@ class LinearImage(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes that radiance and clipped pixels need together."""
+        """Number of bytes that `rgb` and `clipped` need together."""
         return self.rgb.nbytes + self.clipped.nbytes
 
 
@@ -30,8 +30,9 @@ def decode(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Decode pixels. Returns (linear radiance, float32; clipped pixels, bool), both in the shape of `image`.
 
-    `linear`: are the encoded pixels linear, not sRGB? `saturation`: encoded value from which a pixel is clipped.
-    `gamma`, `contrast`: the camera's `Response`, which is inverted. A `LinearImage` is returned as it is.
+    `linear`: True if the encoded pixels are linear, False if they are sRGB. `saturation`: encoded value (1 = full
+    scale) from which a pixel is clipped. `gamma`, `contrast`: the camera's `Response`, which this function inverts. A
+    `LinearImage` is already decoded, and is returned unchanged.
     """
     if isinstance(image, LinearImage):
         return image.rgb.astype(np.float32), image.clipped
@@ -49,7 +50,10 @@ def decode(
 
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
-    """Vignetting times gain at 1 / `scale` of the photograph's size: (H, W, 3), (3,) without vignetting, or 1.0."""
+    """Return the factors of vignetting and gain for each pixel, (H, W, 3), at 1 / `scale` of the photograph's size.
+
+    Without vignetting, it is the gain alone, (3,). If the gain is 1 too, it is the number 1.
+    """
     gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
     if not shot.response.vignetting:
         return gain
@@ -64,10 +68,10 @@ def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
 
 
 def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
-    """Read encoded pixels (H, W, C) of an image file: uint8, uint16 or float32.
+    """Read the encoded pixels (H, W, C) of an image file: uint8, uint16 or float32.
 
-    `field`: name of the file's entry in the scene file `scene`, for messages. Raises InputError as `require_header`
-    does, and if pixels are damaged, infinite, NaN or too large.
+    `field`: name of the file's entry in the scene file `scene`, for messages. Raises the errors of `require_header`.
+    Also raises InputError if pixels are damaged, infinite, NaN or too large.
     """
     require_header(path, field, shot, scene)
     what = f'photograph "{shot.name}", {field}'
@@ -79,9 +83,9 @@ def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
 
 
 def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
-    """Raise InputError if a file is missing or no image, or if its size is not that of the photograph's film.
+    """Raise InputError if a file is missing, if it is no image, or if its size is not that of the film.
 
-    `field`: name of the file's entry in the scene file `scene`.
+    The film is that of the photograph in the scene file `scene`. `field`: name of the file's entry there.
     """
     what = f'photograph "{shot.name}", {field}'
     if not is_file(path):
@@ -94,7 +98,10 @@ def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
 
 
 def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
-    """Read encoded pixels (H, W, 3) of a photograph. If it has an `ambient` image, that is subtracted: float32."""
+    """Read the encoded pixels (H, W, 3) of a photograph.
+
+    If the photograph has an `ambient` image, it is subtracted, and the result is float32.
+    """
     image = read_colours(shot, "filename", scene)
     if not shot.files.ambient:
         return image
@@ -111,9 +118,9 @@ def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
 
 
 def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Read encoded pixels (H, W, 3) of the image file in this `field`.
+    """Read the encoded pixels (H, W, 3) of the image file in `field` of the photograph.
 
-    Grey is repeated; transparent pixels become black.
+    The grey of a grey image is repeated in R, G and B. Transparent pixels become black.
     """
     file = getattr(shot.files, field)
     pixels = read_pixels(file, field, shot, scene)
@@ -131,16 +138,16 @@ def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
 
 
 def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
-    """Test whether encoded pixels are linear radiance. For the encoding `auto` they are, unless they have 8 bits."""
+    """Return whether encoded pixels are linear radiance. With the encoding `auto`, only 8-bit pixels are not linear."""
     if isinstance(pixels, LinearImage):
         return True
     return encoding == "linear" or (encoding == "auto" and pixels.dtype != np.uint8)
 
 
 def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Read the mask (H, W) uint8 from the file in this `field`.
+    """Read the mask (H, W) uint8 from the file in `field` of the photograph.
 
-    If that is the photograph itself, take the alpha channel.
+    If this file is the photograph itself, the mask is its alpha channel. Raises InputError if there is none.
     """
     file, itself = getattr(shot.files, field), getattr(shot.files, field) == shot.files.filename
     pixels = read_pixels(file, field, shot, scene)

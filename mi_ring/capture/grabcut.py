@@ -5,15 +5,15 @@ import numpy as np
 
 
 def disk(radius: float) -> np.ndarray:
-    """Make a structuring element: a disk of this radius [px], at least 1."""
+    """Return a structuring element of OpenCV: a disk with this `radius` [px]. A radius below 1 becomes 1."""
     r = max(1, round(radius))
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
 
 
 def dilate_by_share(coverage: np.ndarray, share: float) -> np.ndarray:
-    """Dilate a mask (H, W) uint8, 0 or 1, by `share` times the square root of the mask's area.
+    """Dilate a mask (H, W) uint8, 0 or 1, by a disk. Its radius is `share` times the square root of the mask's area.
 
-    Negative shares erode it.
+    If `share` is negative, the mask is eroded.
     """
     kernel = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
     return cv2.dilate(coverage, kernel) if share > 0 else cv2.erode(coverage, kernel)
@@ -22,9 +22,9 @@ def dilate_by_share(coverage: np.ndarray, share: float) -> np.ndarray:
 def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band: float) -> np.ndarray:
     """Segment the object in a photograph (H, W, 3) uint8 sRGB. Returns a mask (H, W) uint8, 1 on the object.
 
-    `coverage` (H, W) uint8, 0 or 1: approximate mask. `background` (H, W) bool: certainly not the object. GrabCut
-    decides only near the outline: up to `band` inside and 1.5 times as far outside, relative to the square root of the
-    mask's area.
+    `coverage` (H, W) uint8, 0 or 1: approximate mask. `background` (H, W) bool: pixels that certainly do not show the
+    object. GrabCut decides only about a band along the outline of `coverage`. It reaches `band` · s inside the outline
+    and 1.5 `band` · s outside, where s is the square root of the mask's area [px].
     """
     seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
     seed[dilate_by_share(coverage, 1.5 * band) > 0] = cv2.GC_PR_BGD
@@ -40,6 +40,6 @@ def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band:
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of the masks `a` and `b`; 1 if both are empty."""
+    """Return the intersection over union of the masks `a` and `b`. If both are empty, it is 1."""
     union = int(((a > 0) | (b > 0)).sum())
     return int(((a > 0) & (b > 0)).sum()) / union if union else 1.0

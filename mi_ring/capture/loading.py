@@ -35,10 +35,12 @@ def load_capture(
 ) -> Capture:
     """Read a scene file with photographs. Raises InputError for anything that cannot be fitted.
 
-    `images`: if False, read only cameras and lights, to render. `masks`: "given": those of the scene; "auto": the same,
-    but by brightness if there are none and the room was dark; "none": by brightness, the scene's masks are ignored.
-    `width`: reduce photographs to at most this width [px] and, if `crop`, to the object; see `reduced`. Default: as
-    they are.
+    `images`: False: read only cameras and lights, which is enough for rendering. `width`: reduce photographs to at most
+    this width [px]; see `reduced`. None: keep their size. `crop`: together with `width`, crop photographs to the
+    object.
+
+    `masks`: "given": use the masks of the scene. "auto": the same, but if the scene has none and the room was dark,
+    make masks by brightness. "none": ignore the scene's masks, and make masks by brightness if the room was dark.
     """
     path = Path(path)
     if masks not in ("given", "auto", "none"):
@@ -86,14 +88,14 @@ def load_capture(
 
 
 def require_headers(shot: Shot, scene: Path, masks: str) -> None:
-    """Raise InputError if the header of one of the photograph's files is wrong. `masks`: as for `load_capture`."""
+    """Raise InputError if the header of an image file of a photograph is wrong. `masks`: as for `load_capture`."""
     for field, file in shot.files._asdict().items():
         if file and (field != "mask" or masks != "none"):
             require_header(file, field, shot, scene)
 
 
 def require_capture(path: Path, masks: str) -> None:
-    """Check a scene file and the headers of the images. Raises InputError if one is invalid.
+    """Raise InputError if a scene file, or the header of one of its image files, is invalid. Pixels are not read.
 
     `masks`: as for `load_capture`.
     """
@@ -102,9 +104,9 @@ def require_capture(path: Path, masks: str) -> None:
 
 
 def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
-    """Return the masks (H, W) in this `field` of the photographs; each is read when it is used.
+    """Return the masks (H, W) in `field` of the photographs. Each mask is read when it is used.
 
-    Photographs with the same mask file share the array.
+    Photographs with the same mask file share one array.
     """
     readers: dict[tuple, Reader] = {}
 
@@ -117,7 +119,10 @@ def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
 
 
 def require_scene(path: Path) -> None:
-    """Raise InputError, with advice what to give instead, if `path` does not exist or is a photograph."""
+    """Raise InputError if `path` does not exist, or if it is a photograph or a folder.
+
+    The message says what to give instead.
+    """
     photographs = path.is_dir() or path.suffix.lower() in SUFFIXES
     usual = "the XML file of a scene" + ("; mi-ring photos makes one of a folder of photographs" * photographs)
     inside = path / "scene.xml"
@@ -127,7 +132,10 @@ def require_scene(path: Path) -> None:
 
 
 def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
-    """Load the scene in a file and its photographs. Raises InputError if it cannot be read or has no photographs."""
+    """Load a scene file. Returns (scene, its photographs).
+
+    Raises InputError if the file cannot be read, or if it has no photographs.
+    """
     require_scene(path)
     try:
         require_xml(path)
@@ -152,7 +160,10 @@ def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
 
 
 def require_xml(path: Path) -> None:
-    """Raise InputError if the XML is invalid or a sensor lacks its pose, which Mitsuba would place at the origin."""
+    """Raise InputError if the XML is invalid, or if a photograph or its point light has no position.
+
+    Mitsuba would put it at the origin. Raises UnicodeDecodeError if the file is not UTF-8.
+    """
     content = path.read_bytes()
     content.decode("utf-8")
     try:
@@ -171,13 +182,16 @@ def require_xml(path: Path) -> None:
 
 
 def load_views(path: Path) -> list[MaskedCamera]:
-    """Read the cameras of a scene file, each with the mask of valid pixels. Raises InputError if reading fails."""
+    """Read the cameras of a scene file, each with its mask of valid pixels. Raises InputError if this fails."""
     _, shots = open_scene(path)
     return views_of(shots, masks_of(shots, "valid", path))
 
 
 def recompute_normals(scene: mi.Scene) -> None:
-    """Recompute vertex normals of meshes whose files have none, so that all processes get the same normals."""
+    """Recompute the vertex normals of those meshes in `scene` whose files have none. `scene` is changed.
+
+    After this, all processes have the same normals.
+    """
     for shape in scene.shapes():
         if not shape.is_mesh() or not shape.has_vertex_normals():
             continue
@@ -190,7 +204,7 @@ def recompute_normals(scene: mi.Scene) -> None:
 
 
 def reason(error: RuntimeError) -> str:
-    """Return the message of a Mitsuba parser error in one line."""
+    """Return the message of a Mitsuba parser error as one line."""
     text = str(error).split("] ", 1)[-1]
     if "Traceback" in text:  # of one of our plugins: the message follows the name of the exception
         text = text.split("Error: ", 1)[-1]

@@ -1,4 +1,4 @@
-"""The pixels of photographs for a fit: linear radiance, clipped pixels, masks."""
+"""The pixels of photographs, as a fit needs them: linear radiance, clipped pixels, masks."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -16,7 +16,7 @@ REMEMBERED_PIXELS = 2**24
 
 
 class Observation(NamedTuple):
-    """The pixels of n photographs of one size, with which a fit compares: radiance, clipped pixels, masks."""
+    """The pixels of n photographs of one size: radiance, clipped pixels, masks. A fit compares renderings with them."""
 
     rgb: Tensor  #: (n, H, W, 3) linear radiance, 1.0 = full scale of the file
     clipped: Tensor  #: (n, H, W, 3) bool: the true radiance is at least this
@@ -25,17 +25,21 @@ class Observation(NamedTuple):
     valid: Tensor | None  #: (n, H, W) bool; invalid pixels are black and clipped. None: all are valid
 
     def surely(self, coverage: Tensor) -> Tensor:
-        """Find pixels (n, H, W) bool that show only the object, by `coverage` (n, H, W) and by the masks, if any."""
+        """Return which pixels show only the object, (n, H, W) bool.
+
+        `coverage` (n, H, W): the object's share of each pixel. It must be above 0.99. If the photograph has a mask, the
+        mask must be above 0.99, too.
+        """
         mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
         return torch.minimum(mask, coverage) > 0.99
 
     def to(self, device: torch.device) -> "Observation":
-        """Move the tensors to a device."""
+        """Return the observation with its tensors on `device`."""
         return Observation(*(None if tensor is None else tensor.to(device) for tensor in self))  # type: ignore[arg-type]
 
     @classmethod
     def joined(cls, several: Sequence["Observation"]) -> "Observation":
-        """Join several observations of one size into one."""
+        """Join several observations into one. All must be of the same image size."""
         *parts, valid = zip(*several)
         rgb, clipped, mask, masked = map(torch.cat, parts)
         if all(v is None for v in valid):
@@ -47,9 +51,9 @@ class Observation(NamedTuple):
 def observed(
     shot: Shot, image: np.ndarray | LinearImage, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
 ) -> Observation:
-    """Make the observation of one photograph: decode pixels (H, W, 3), and reduce them `scale` times by a box filter.
+    """Make the observation of one photograph: decode its pixels, and reduce them by the factor `scale` (box filter).
 
-    `mask`, `valid`: (H, W) uint8 as in the files; None if the photograph has none.
+    `image` (H, W, 3): encoded pixels. `mask`, `valid`: (H, W) uint8 as in the files; None if the photograph has none.
     """
     curve = shot.response.gamma, shot.response.contrast
     linear, clipped = decode(image, is_linear(shot.encoding, image), shot.saturation, *curve)
@@ -71,16 +75,16 @@ def observed(
 
 
 class ObservationCache:
-    """Caches observations of single photographs, of the last used scale only, up to `REMEMBERED_PIXELS`.
+    """Cache of the observations of single photographs, with up to `REMEMBERED_PIXELS` pixels in total.
 
-    At scale 1, nothing is cached.
+    For each photograph, it keeps the observation of the scale that was used last. It keeps none of scale 1.
     """
 
     def __init__(self) -> None:
         self.kept: dict[int, tuple[int, Observation]] = {}  # scale and observation by index
 
     def get(self, k: int, scale: int, observe: Callable[[], Observation]) -> Observation:
-        """Return the observation of photograph `k` at this scale. Calls `observe` if it is not in the cache."""
+        """Return the observation of photograph `k` at this scale. If the cache does not have it, `observe` makes it."""
         if k in self.kept and self.kept[k][0] == scale:
             return self.kept[k][1]
         self.kept.pop(k, None)

@@ -1,4 +1,4 @@
-"""Pixels of many files, read on demand and cached."""
+"""Pixels of many files. They are read when they are used, and cached."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -12,20 +12,21 @@ Reader = Callable[[], np.ndarray]
 
 
 class Pixels(Sequence):
-    """A sequence of arrays. Each is read by its reader when it is used; None where there is no reader.
+    """A sequence of arrays. An array is read when it is used.
 
-    Equal readers share one array. Parts of a sequence share the cache, which keeps the arrays read first: a fit draws
-    photographs at random, so no other rule is better.
+    Each item has a reader, which is a function that returns the array. An item without a reader is None. Items with
+    equal readers share one array. The cache keeps the arrays that were read first, up to `KEPT` bytes. A fit draws
+    photographs at random, so no other rule is better. Parts of a sequence share its cache.
     """
 
     def __init__(self, readers: Iterable[Reader | None] = (), kept: dict[Reader, np.ndarray] | None = None) -> None:
-        """Take a reader for each array. `kept`: the cache of arrays by their readers; default: an empty one."""
+        """Make a sequence with one reader for each item. `kept`: its cache, from readers to arrays; default: empty."""
         self.readers = tuple(readers)
         self.kept: dict[Reader, np.ndarray] = {} if kept is None else kept
 
     @classmethod
     def of(cls, arrays: Iterable[np.ndarray | None]) -> "Pixels":
-        """Make a sequence from arrays in memory."""
+        """Make a sequence of arrays that are in memory. They are not copied."""
         return cls(None if array is None else partial(np.asarray, array) for array in arrays)
 
     def __len__(self) -> int:
@@ -44,15 +45,15 @@ class Pixels(Sequence):
 
     @property
     def given(self) -> list[bool]:
-        """For each index: is there a reader?"""
+        """For each item, whether it has a reader."""
         return [reader is not None for reader in self.readers]
 
     def part(self, index: Iterable[int]) -> "Pixels":
-        """Return the subsequence with these indices."""
+        """Return the sequence of the items with these indices. It shares the cache."""
         return Pixels([self.readers[k] for k in index], self.kept)
 
     def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":
-        """Return a copy of the sequence with other readers at the indices in `readers`."""
+        """Return a copy of the sequence in which items have other readers. `readers`: the new ones, by index."""
         several = [readers.get(k, reader) for k, reader in enumerate(self.readers)]
         left = {*several}
         return Pixels(several, {reader: array for reader, array in self.kept.items() if reader in left})

@@ -1,4 +1,4 @@
-"""Large photographs made small: cropped to the object and averaged once, and kept in the cache folder."""
+"""Makes large photographs small: crops them to the object and averages pixels. The cache folder keeps the results."""
 
 import contextlib
 import hashlib
@@ -40,10 +40,10 @@ MORE = np.array([[-1], [1]])  #: bounds found in a reduced mask are widened by o
 
 
 def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, crop: bool = True) -> Capture:
-    """Reduce the photographs of a capture to at most `width` [px], and crop them to the object where that helps.
+    """Return a capture with photographs of at most `width` [px], cropped to the object where this saves enough pixels.
 
-    `by_brightness`: find masks as `with_masks_by_brightness` does. Without `crop`, only reduce. Small photographs stay
-    as they are; so do all photographs of a capture that was reduced before, to whatever width. Raises InputError like
+    `by_brightness`: first make masks as `with_masks_by_brightness` does. `crop`: False: only reduce. Small photographs
+    are not changed. If the capture was reduced before, nothing is changed, whatever its width. Raises InputError like
     `load_capture`.
     """
     small = all(shot.size[0] <= SMALL and reduction_factor(shot.size, width) == 1 for shot in capture.shots)
@@ -69,17 +69,17 @@ def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, c
 
 
 def reduction_factor(size: tuple[int, ...], width: int) -> float:
-    """Factor, at least 1, by which an image must shrink to be at most `width` [px] wide.
+    """Return the factor by which an image must shrink to be at most `width` [px] wide. It is at least 1.
 
-    `size`: (width, height) [px].
+    `size`: (width, height) [px] of the image. The height may be at most `HIGHEST` · `width`.
     """
     return max(1.0, size[0] / width, size[1] / (HIGHEST * width))
 
 
 def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], width: int) -> Window:
-    """Make the window with corner `low` (2,) and size `extent` (2,) [px], reduced to at most `width` [px].
+    """Return the window with the upper left corner `low` (2,) and the size `extent` (2,) [px of the photograph].
 
-    `whole`: (width, height) [px] of the photograph.
+    It is reduced to at most `width` [px]. `whole`: (width, height) [px] of the photograph.
     """
     scale = reduction_factor(tuple(extent), width)
     blocks = int(scale)  # the first step of the reduction averages squares of so many pixels
@@ -92,8 +92,9 @@ def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], widt
 def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], width: int) -> list[Window]:
     """Choose a window around the object in each photograph, reduced to at most `width` [px].
 
-    `bounds`: for each mask the lowest and highest corner (2, 2) [px], or None without a mask. Photographs of one size
-    get windows of one size, to be rendered together. If one of these has no mask, none of them is cropped.
+    `bounds`: for each photograph, the lowest and highest corner (2, 2) [px] of the object; None if it has no mask.
+    Photographs of one size get windows of one size, so that one launch can render them together. If one of these has no
+    mask, none of them is cropped.
     """
     windows = []
     sizes = [shot.size for shot in shots]
@@ -110,9 +111,9 @@ def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], wid
 
 
 def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
-    """Find the lowest and highest corner (2, 2) [px] of the object in each mask. None without a mask or if it is empty.
+    """Return the lowest and highest corner (2, 2) [px] of the object in each mask. None if it is missing or empty.
 
-    `large`: are masks large? Their corners are then kept in the cache folder.
+    `large`: True if the masks are large. Then the cache folder keeps the corners.
     """
     several = {reader: k for k, reader in enumerate(capture.masks.readers) if reader}  # some may share a mask
 
@@ -140,9 +141,10 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
 
 
 def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
-    """Return a capture in which each photograph shows only its window. Photographs in files are read now.
+    """Return a capture in which each photograph shows only its window.
 
-    `doing`: label of the progress bar.
+    If the photographs are files, they are read now, and the cache folder keeps the results. `doing`: label of the
+    progress bar.
     """
     shots = tuple(shot.through(window) for shot, window in zip(capture.shots, windows))
 
@@ -183,9 +185,9 @@ def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
 
 
 def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[int], doing: str) -> list[Any]:
-    """Call `function(k)`, which decodes a photograph, for each `index`, in as many threads as memory allows.
+    """Call `function(k)` for each k of `index`, in as many threads as memory allows. Returns the results in order.
 
-    Returns the results in order. `doing`: label of the progress bar.
+    `function` decodes photograph k. `doing`: label of the progress bar.
     """
 
     def memory(shot: Shot) -> int:
@@ -199,9 +201,9 @@ def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[in
 
 
 def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
-    """Decode a photograph to linear radiance, crop it to the window and resize it to the window's size.
+    """Decode a photograph to linear radiance, crop it to the window, and resize it to the window's size.
 
-    Works in strips to save memory. Returns float16 for a photograph of 8 bits, otherwise float32.
+    It works in strips to save memory. Returns float16 for a photograph of 8 bits, otherwise float32.
     """
     image = read()
     radiance, clipped = [], []
@@ -219,24 +221,27 @@ def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
 
 
 def reduced_mask(read: Reader, window: Window) -> np.ndarray:
-    """Reduce a mask to a window: (H, W) uint8, the object's coverage."""
+    """Crop a mask to a window and resize it: (H, W) uint8, the object's coverage from 0 to 255."""
     return means(read(), window).round().astype(np.uint8)
 
 
 def reduced_valid(read: Reader, window: Window) -> np.ndarray:
-    """Reduce a mask of valid pixels to a window: (H, W) uint8, 255 where all pixels of the photograph are valid."""
+    """Crop a mask of valid pixels to a window and resize it: (H, W) uint8.
+
+    A pixel is 255 if all pixels of the photograph that it covers are valid. Otherwise it is 0.
+    """
     return np.where(means(read() > 127, window) > 1 - 1e-5, np.uint8(255), np.uint8(0))
 
 
 def means(mask: np.ndarray, window: Window) -> np.ndarray:
-    """Reduce a mask (H, W) to a window by area means."""
+    """Crop a mask (H, W) to a window, and resize it by area means."""
     (left, top), (width, height) = window.corner, window.extent
     part = mask[top : top + height, left : left + width, None]
     return resized(averaged(part, window.blocks), window)[..., 0]
 
 
 def averaged(pixels: np.ndarray, blocks: int) -> np.ndarray:
-    """Average blocks of `blocks` × `blocks` pixels of an image (H, W, C): float32."""
+    """Average blocks of `blocks` × `blocks` pixels of an image (H, W, C). Returns float32."""
     return box_filter(torch.from_numpy(np.ascontiguousarray(pixels, np.float32)), blocks).numpy()
 
 
@@ -248,7 +253,7 @@ def resized(pixels: np.ndarray, window: Window) -> np.ndarray:
 
 
 def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
-    """Paste the mask (h, w) uint8 of a window into one of the whole photograph (H, W), 0 outside the window."""
+    """Paste the mask (h, w) uint8 of a window into a mask (H, W) of the whole photograph, 0 outside the window."""
     if window is None:
         return mask
     (left, top), (width, height) = window.corner, window.extent
@@ -258,9 +263,9 @@ def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
 
 
 def source(read: Reader | None) -> tuple | None:
-    """Describe what a reader of `mi_ring.capture.decoding` reads: its name, the field, digests of the files.
+    """Return a tuple that identifies what a reader of `mi_ring.capture.decoding` reads, by digests of the files.
 
-    None for any other reader.
+    Returns None for any other reader.
     """
     if not isinstance(read, partial) or read.func not in (read_photograph, read_mask):
         return None
@@ -270,7 +275,7 @@ def source(read: Reader | None) -> tuple | None:
 
 
 def key_of(*parts: Any) -> str:
-    """Hash `parts`, from which something is computed, to its key in the cache."""
+    """Return the key in the cache for a result that is computed from `parts`. It is a hash of them."""
     return hashlib.blake2b(repr((FORMAT, *parts)).encode(), digest_size=16).hexdigest()
 
 
@@ -284,7 +289,7 @@ def packed(arrays: dict[str, Any]) -> memoryview:
 
 
 def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | LinearImage:
-    """Read the array `name` from the cache entry `key`. If the entry is missing or damaged, call `make` instead."""
+    """Read the array `name` from the cache entry `key`. If the entry is missing or damaged, return `make()` instead."""
     path = cache.cached(key)
     try:
         with np.load(path or "") as file:

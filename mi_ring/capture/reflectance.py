@@ -1,4 +1,4 @@
-"""Chooses the parameters of a scene's BSDF that BRDF-Net predicts: the paper's five, or those of any other BSDF."""
+"""Chooses the parameters of a scene's BSDF that BRDF-Net predicts: the paper's five, or those of another BSDF."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -16,9 +16,10 @@ from mi_ring.scene.xml_elements import load_bsdf
 def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
     """Choose the BSDF parameters that BRDF-Net predicts. Returns (parameters, XML of the BSDF that reads them).
 
-    `ranges`: (lowest, highest) value by the parameter's name in the BSDF's documentation; infinity: no highest value.
-    Empty: all parameters of `cooktorrance` that are not constant. Raises InputError for parameters that the BSDF does
-    not have; the message lists those that exist.
+    `ranges`: a dict from names of parameters to (lowest, highest) values. The names are those in the BSDF's
+    documentation. An infinite highest value means no upper limit. If the dict is empty, all parameters of
+    `cooktorrance` are chosen that are not constant. Raises InputError if the BSDF has no such parameter. The message
+    lists those that exist.
     """
     scene, bsdf = capture.path, capture.shape.bsdf()
     element = bsdf_element(ElementTree.fromstring(capture.xml), scene)[1]
@@ -72,9 +73,9 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:
-    """Network output for which BRDF-Net predicts the mean of `value` in the range from `low` to `high`.
+    """Return the network output for which BRDF-Net predicts the mean of `value`, in the range from `low` to `high`.
 
-    It is 0 if `high` is infinite.
+    If `high` is infinite, returns 0.
     """
     if math.isinf(high):
         return 0.0

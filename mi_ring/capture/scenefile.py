@@ -1,4 +1,4 @@
-"""Writes and rewrites the XML of scene files: photographs, cameras, lights, the fitted object."""
+"""Writes the XML of scene files, and changes it: photographs, cameras, lights, the fitted object."""
 
 import math
 import os
@@ -33,7 +33,7 @@ REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *OPTIONAL}
 
 
 def photograph_element(shot: Shot) -> Element:
-    """Make the XML of a photograph. The shot's file names must be relative to the scene file."""
+    """Make the XML of a photograph. The file names in `shot` must be relative to the scene file."""
     shot = shot.whole
     element = ElementTree.Element("sensor", type="photograph", id=shot.name)
     for field, file in shot.files._asdict().items():
@@ -65,10 +65,11 @@ def scene_element(
     photographs: Iterable[Element] = (), center: np.ndarray | None = None, radius: float | None = None,
     ground: np.ndarray | None = None, up: np.ndarray | None = None, metres: float | None = None, fresnel: bool = False,
 ) -> Element:  # fmt: skip
-    """Make the XML of a scene of photographs, with `photometric` and a `shapenet` with `cooktorrance`.
+    """Make the XML of a scene with these photographs, a `photometric` integrator and a `shapenet` with `cooktorrance`.
 
     `center` (3,), `radius`: normalising sphere [scene units]. `ground` (3,): a point on the table. `up` (3,): normal of
-    the table, or up direction. `metres`: length of a scene unit [m]; None: unknown. `fresnel`: with the Fresnel term?
+    the table, or up direction. `metres`: length of a scene unit [m]; None: unknown. `fresnel`: give `cooktorrance` its
+    Fresnel term.
     """
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
@@ -90,7 +91,7 @@ def scene_element(
 def table_element(picture: str, square: np.ndarray) -> Element:
     """Make the XML of a diffuse `table`. `picture`: image file of the albedo.
 
-    `square` (4, 4): transform of the square.
+    `square` (4, 4): its transform `to_world`.
     """
     element = ElementTree.Element("shape", type="table")
     add_pose(element, square)
@@ -102,7 +103,7 @@ def table_element(picture: str, square: np.ndarray) -> Element:
 
 
 def scene_bytes(root: Element) -> bytes:
-    """Serialise the XML of a scene to the content of a file."""
+    """Return the XML of a scene as the content of a file."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, "utf-8")
 
@@ -122,8 +123,8 @@ def emitter_element(light: Light) -> Element:
 def perspective_element(camera: Camera, points: np.ndarray) -> Element:
     """Make the XML of a camera as Mitsuba's `perspective`, without lens distortion.
 
-    The clipping planes enclose `points` (n, 3). Mitsuba's pixels are square: if the camera's are not, the number of
-    rows is changed.
+    The clipping planes enclose `points` (n, 3). Mitsuba's pixels are square. If the camera's pixels are not, the number
+    of rows is changed.
     """
     (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
     distance = np.linalg.norm(points - camera.position, axis=1)
@@ -148,14 +149,14 @@ def add_pose(element: Element, to_world: np.ndarray) -> None:
 
 
 def add_film(sensor: Element, width: int, height: int) -> None:
-    """Add a film of this size [px] to the XML of a sensor."""
+    """Add a film of `width` × `height` [px] to the XML of a sensor."""
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
     for name, pixels in (("width", width), ("height", height)):
         ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
 
 
 def numbers(values: ArrayLike) -> str:
-    """Format numbers as text for XML."""
+    """Format numbers as text for XML, separated by spaces."""
     return " ".join(f"{v:.9g}" for v in np.ravel(values))
 
 
@@ -163,11 +164,12 @@ def recalibrated_xml(
     scene: bytes, shots: Sequence[Shot], room: np.ndarray | None = None, frames: Collection[str] | None = None,
     lamps: Iterable[Light] | None = None,
 ) -> bytes:  # fmt: skip
-    """Rewrite a scene file with the cameras, lights and responses of `shots`, matched by id, else by order.
+    """Return the content of a scene file with the cameras, lights and responses of `shots`.
 
-    `room` (BASIS, 3): room light. `frames`: axes ("world", "camera") in which a `room` is written even if it is black;
-    default: those of the rooms in the file. `lamps`: point and directional lights for all photographs; default: those
-    of the file.
+    A shot belongs to the photograph with its name as id. If there is none, it belongs to the photograph at the same
+    position. `room` (BASIS, 3): room light; None: the scene gets none. `frames`: axes ("world", "camera") for which
+    room light is written even if it is black; default: the axes of the rooms in the file. `lamps`: point and
+    directional lights for all photographs; None: keep those of the file.
     """
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
@@ -193,7 +195,7 @@ def recalibrated_xml(
 
 
 def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
-    """Rewrite a scene file: its photographs are replaced by `shots`."""
+    """Return the content of a scene file in which `shots` replace the photographs."""
     root = ElementTree.fromstring(scene)
     for element in root.findall("sensor[@type='photograph']"):
         root.remove(element)
@@ -202,7 +204,10 @@ def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
 
 
 def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) -> bytes:
-    """Rewrite a scene file of `shots` with new masks. `masks`: mask files, relative to it, by photograph index."""
+    """Return the content of a scene file with new masks. `shots`: its photographs.
+
+    `masks`: a dict from the index of a photograph to its mask file, relative to the scene file.
+    """
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
         if k in masks:
@@ -213,9 +218,11 @@ def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) 
 
 
 def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, int]]:
-    """Find the XML elements of photographs in a scene file. Returns (element, index in `shots`), by id, else by order.
+    """Find the XML elements of photographs in a scene. Returns (element, index in `shots`) for each.
 
-    Photographs that are not in `shots` are removed from `root`. Raises InputError if ids are needed and missing.
+    An element belongs to the shot with its id. If there is none, it belongs to the shot at the same position. If there
+    are more elements than shots, elements without a shot are removed from `root`. Raises InputError if ids are needed
+    for this and are missing.
     """
     elements = root.findall(".//sensor[@type='photograph']")
     named = {shot.name: k for k, shot in enumerate(shots)}
@@ -230,9 +237,9 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
 
 
 def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:
-    """Make the XML of room light (BASIS, 3): one element for the part in world axes, one for the part in camera axes.
+    """Make the XML of room light (BASIS, 3). One element has the part in world axes, another the part in camera axes.
 
-    A black part is left out unless its axes, "world" or "camera", are in `frames`.
+    A black part is left out, unless `frames` contains its axes ("world" or "camera").
     """
     world, camera = room[:PER_FRAME], np.vstack([np.zeros_like(room[:1]), room[PER_FRAME:]])
     # Uniform light belongs to either part.
@@ -243,9 +250,9 @@ def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Elemen
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:
-    """Make the XML of a `room`. `frame`: "world" or "camera".
+    """Make the XML of a `room`. `frame`: its axes, "world" or "camera".
 
-    `harmonics`: (PER_FRAME, 3) or fewer rows, in these axes.
+    `harmonics`: (PER_FRAME, 3), or fewer rows.
     """
     orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
     harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
@@ -256,7 +263,7 @@ def room_element(frame: str, harmonics: np.ndarray) -> Element:
 
 
 def move_names(root: Element, source: Path, folder: Path) -> None:
-    """Rewrite file names in a scene: those relative to the folder `source` become relative to `folder`."""
+    """Change the file names in a scene. Names relative to the folder `source` become relative to `folder`."""
     for element in root.iter("string"):
         if element.get("name") not in FILES:
             continue
@@ -266,10 +273,10 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
 
 
 def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
-    """Rewrite the scene file `path` for the results folder `folder`, with the fitted object and its `bsdf` (XML).
+    """Return the content of the scene file `path` for the results folder `folder`, with the fitted object.
 
-    `subdivisions`: level of the mesh. File names become relative to `folder`. Raises InputError if the scene or the
-    `shapenet` cannot be rewritten or fitted.
+    `subdivisions`: level of its mesh. `bsdf`: XML of its BSDF. File names become relative to `folder`. Raises
+    InputError if the scene or the `shapenet` cannot be rewritten or fitted.
     """
     root = ElementTree.parse(path).getroot()
     old_bsdf, _ = bsdf_element(root, path)
@@ -288,9 +295,9 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
 
 
 def bsdf_element(root: Element, path: Path) -> tuple[Element, Element]:
-    """Find the BSDF of the `shapenet` in a scene file. Returns (its <bsdf> or <ref>, the <bsdf> itself).
+    """Find the BSDF of the `shapenet` in a scene. Returns (its <bsdf> or <ref>, the <bsdf> itself).
 
-    Raises InputError, which names the file `path`, if there is none, or if a part of the scene is in another file.
+    Raises InputError if there is none, or if a part of the scene is in another file. The message names the file `path`.
     """
     for tag in ("include", "default", "path"):
         if root.find(f".//{tag}") is not None:
