@@ -1,7 +1,7 @@
-"""Automatic masks: a first guess, then alternately GrabCut in each photograph and a vote of all masks on voxels.
+"""Automatic masks: a first guess, then in turn GrabCut in each photograph and a vote of all masks on voxels.
 
-A voxel stays if most photographs that show it have it in their mask. The vote removes lamps and highlights, which are
-in few masks. It also empties concavities that some masks fill, for instance with a shadow.
+A voxel stays if it is in the masks of most photographs that show it. The vote removes lamps and highlights, because
+these are in few masks. It also empties a concavity that some masks fill, for example with a shadow.
 """
 
 import itertools
@@ -32,7 +32,7 @@ MIN_RADIANCE = 1e-3  #: lower radiance counts as this
 
 
 class RefinementSettings(NamedTuple):
-    """Settings of `refine_masks`: agreement that the vote needs, width of GrabCut's band, number of rounds."""
+    """Settings of `refine_masks`: agreement needed in the vote, width of GrabCut's band, number of rounds."""
 
     agreement: float  #: share of the masks that must contain a voxel
     band: float  #: width of the band around the silhouette in which GrabCut decides [object's size]
@@ -59,20 +59,20 @@ class VoxelObject:
         return self.corner + self.spacing * np.argwhere(self.voxels)
 
     def silhouette(self, view: ReducedView) -> np.ndarray:
-        """Project the voxels to a view: (H, W) uint8, 1 where the view shows the object."""
+        """Project the voxels to a view. Returns a mask (H, W) uint8, 1 where the view shows the object."""
         row, column, inside = view.project(self.points)
         mask = np.zeros(view.valid.shape, np.uint8)
         mask[row[inside], column[inside]] = 1
         return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.voxel_pixels(view) + 1))
 
     def voxel_pixels(self, view: ReducedView) -> float:
-        """Width of a voxel in a view [px]."""
+        """Return the width of a voxel in a view [px]."""
         distance = np.median(np.linalg.norm(self.points - view.camera.position, axis=1))
         return float(self.spacing * view.camera.focal.mean() / distance)
 
 
 class VoxelGrid:
-    """A cube of voxels around `center` (3,), with edges of length 2 · `half_size`, and the views that see it."""
+    """A cube of voxels around `center` (3,), and the views that see it. Its edges have the length 2 · `half_size`."""
 
     def __init__(self, views: Views, center: np.ndarray, half_size: float) -> None:
         self.views, self.center, self.half_size = views, center, half_size
@@ -83,12 +83,12 @@ class VoxelGrid:
 
     @property
     def camera_distance(self) -> float:
-        """Median distance from the cameras to the centre."""
+        """Median distance of the cameras from the centre."""
         return float(np.median([np.linalg.norm(view.camera.position - self.center) for view in self.views]))
 
     @classmethod
     def seen_by(cls, views: Views) -> "VoxelGrid":
-        """Make a grid around the point that the cameras look at, so large that it fills the median photograph."""
+        """Make a grid around the point at which the cameras look. It is so large that it fills the median photograph."""
         cameras = [view.camera for view in views]
         origins = np.stack([camera.position for camera in cameras])
         center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), "cameras")
@@ -97,14 +97,15 @@ class VoxelGrid:
 
     @classmethod
     def around(cls, views: Views, found: VoxelObject) -> "VoxelGrid":
-        """Make a grid that is a little larger than the object `found`, around it."""
+        """Make a grid around the object `found`. The grid is a little larger than the object."""
         low, high = found.points.min(0), found.points.max(0)
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
     def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
-        """Find the object: the largest connected component of voxels that most masks contain. None if it is too small.
+        """Find the object by a vote of the masks. It is the largest connected component of the voxels that are chosen.
 
-        `agreement`: share of the masks that must contain a voxel. `voters`: which masks vote; None: all.
+        Returns None if it is too small. `agreement`: share of the masks that must contain a voxel. `voters`: for each
+        mask, whether it votes; None: all vote.
         """
         yes, shown = np.zeros((2, len(self.points)), np.int16)
 
@@ -124,20 +125,23 @@ class VoxelGrid:
 
 
 def empty_masks(views: Views) -> list[np.ndarray]:
-    """Make a mask (H, W) uint8 of zeros for each view."""
+    """Return a mask (H, W) uint8 of zeros for each view."""
     return [np.zeros(view.valid.shape, np.uint8) for view in views]
 
 
 def bright_mask(view: ReducedView) -> np.ndarray:
-    """Mask (H, W) uint8 of pixels that are near the flash: 1 where log radiance is above Otsu's threshold."""
+    """Return a mask (H, W) uint8 of bright pixels: 1 where the log radiance is above Otsu's threshold.
+
+    These pixels are near the flash.
+    """
     log = np.log(np.maximum(view.linear.max(-1), MIN_RADIANCE))
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
 def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
-    """Test for each view whether the mask is complete, compared with the silhouette of the common object.
+    """Return for each view whether its mask is complete. `silhouettes`: of the object that all masks agree on.
 
-    A mask is complete if it misses about as little of the silhouette as the other masks do.
+    A complete mask misses about as little of its silhouette as the other masks do of theirs.
     """
     missing = [
         (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
@@ -157,10 +161,10 @@ class Segmentation(NamedTuple):
 def refine_masks(
     grid: VoxelGrid, guesses: Masks, backgrounds: Masks, progress: Progress, settings: RefinementSettings = LOCATION
 ) -> Segmentation | None:  # fmt: skip
-    """Refine masks by alternating between the vote of all views and GrabCut in each. None if the guesses disagree.
+    """Refine masks: in turn, all views vote on the object, and GrabCut finds new masks around its silhouettes.
 
-    `guesses` (H, W) of each view: above 0 on the guessed object. `backgrounds` (H, W) of each view: above 0 where the
-    object certainly is not.
+    `guesses`: for each view, an array (H, W) above 0 on the guessed object. `backgrounds`: for each view, an array (H,
+    W) above 0 where the object certainly is not. Returns None if the masks do not agree on any object.
     """
 
     def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -183,18 +187,24 @@ def refine_masks(
 
 
 def resize_mask(mask: np.ndarray, view: ReducedView) -> np.ndarray:
-    """Resize a mask (h, w) to the view: (H, W) bool."""
+    """Resize a mask (h, w) to the size of the view. Returns (H, W) bool."""
     return cv2.resize(mask.astype(np.float32), view.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def disputed_pixels(mask: np.ndarray, silhouette: np.ndarray, tolerance: float) -> np.ndarray:
-    """Mark where a mask differs from the silhouette by over `tolerance` [px]: (H, W) uint8; often a shadow."""
+    """Return a mask (H, W) uint8: 1 where `mask` and `silhouette` differ by more than `tolerance` [px].
+
+    Such pixels often show a shadow.
+    """
     wide, narrow = cv2.dilate(silhouette, disk(tolerance)), cv2.erode(silhouette, disk(tolerance))
     return ((mask > 0) & (wide == 0)).astype(np.uint8) | ((mask == 0) & (narrow > 0)).astype(np.uint8)
 
 
 def touching_pixels(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Find parts of `guess` that touch the mask from outside, such as a rod that holds the object: (H, W) uint8."""
+    """Return a mask (H, W) uint8 of those parts of `guess` that are outside `mask` and touch it.
+
+    For example, such a part is a rod that holds the object.
+    """
     labels, _ = pieces((guess > 0) & (mask == 0))
     touching = np.unique(labels[cv2.dilate(mask, disk(2)) > 0])
     return np.isin(labels, touching[touching > 0]).astype(np.uint8)

@@ -22,7 +22,11 @@ ITERATIONS = 10  #: of the solver per call; a call of pycolmap cannot be interru
 
 
 def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, progress: Progress) -> Any:
-    """Bundle-adjust a model, and return it. The sheet's corners are used unless they contradict the image features."""
+    """Bundle-adjust a model, and return the adjusted model.
+
+    The sheet's corners are used as points. But if they increase the error of the image features too much, they are
+    ignored.
+    """
     model.tear_down()  # covariances are refused if an image has no pose
     list(progress(robust_adjustment(model), "bundle adjustment"))
     held = pycolmap.Reconstruction(model)
@@ -39,7 +43,10 @@ def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, prog
 
 
 def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections) -> list[int]:
-    """Add the sheet's corners to a model, each as `CORNER_WEIGHT` equal points. Returns the ids of these points."""
+    """Add the sheet's corners to a model, each as `CORNER_WEIGHT` equal points. Returns the ids of these points.
+
+    `model` is changed.
+    """
     seen: dict[int, list[tuple[Any, np.ndarray]]] = {}
     for image, picture, scale in registered(model, pictures):
         if detection := detections.get(picture.name):
@@ -57,7 +64,10 @@ def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections)
 
 
 def robust_adjustment(model: Any) -> Iterator[None]:
-    """Bundle-adjust a model with a robust loss, and remove outliers. Yields before each call of the solver."""
+    """Bundle-adjust a model with a robust loss, and remove outliers. `model` is changed.
+
+    Yields before each call of the solver.
+    """
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
         yield from solve(model, *adjustment_problem(model), 100 // ITERATIONS)
@@ -66,7 +76,7 @@ def robust_adjustment(model: Any) -> Iterator[None]:
 
 
 def adjustment_problem(model: Any) -> tuple[Any, Any]:
-    """Return (options, configuration) of a bundle adjustment of all images of a model, with a robust loss."""
+    """Return (options, configuration) for a bundle adjustment of all images of a model, with a robust loss."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.solver_options.function_tolerance = CONVERGED
@@ -79,7 +89,7 @@ def adjustment_problem(model: Any) -> tuple[Any, Any]:
 
 
 def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
-    """Call the solver until it converges, at most `calls` times. Yields before each call."""
+    """Call the solver until it converges, at most `calls` times. `model` is changed. Yields before each call."""
     for _ in range(calls):
         yield
         summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
@@ -88,7 +98,10 @@ def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
 
 
 def refine_principal_points(model: Any, progress: Progress) -> Any:
-    """Refine the principal points of a model, and return it. Points that are poorly determined keep their values."""
+    """Refine the principal points of a model, and return the refined model.
+
+    If the data do not determine the principal point of a camera well, it keeps its value.
+    """
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
     fixed: set[int] = set()
     while fixed < lenses:
@@ -108,9 +121,9 @@ def refine_principal_points(model: Any, progress: Progress) -> Any:
 
 
 def is_determined(camera: Any, covariance: Any) -> bool:
-    """Test whether the principal point of a camera is well determined.
+    """Return whether the principal point of a camera is well determined.
 
-    `covariance`: a `pycolmap.BACovariance`; None if it could not be computed.
+    `covariance`: a `pycolmap.BACovariance`; None if it could not be computed, which counts as not determined.
     """
     own = covariance and covariance.get_other_params_cov(camera.params)
     if own is None:
@@ -120,7 +133,7 @@ def is_determined(camera: Any, covariance: Any) -> bool:
 
 
 def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, Picture, int]]:
-    """Yield (image, photograph, factor) for each image with a pose.
+    """Yield (image, photograph, factor) for each image of the model that has a pose.
 
     The photograph is `factor` times as large as the image.
     """
@@ -131,7 +144,10 @@ def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, P
 
 
 def model_cameras(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
-    """Return (lens, camera-to-world pose (4, 4)) of each photograph with a pose, by the photograph's name."""
+    """Return the cameras of a model: a dict from names of photographs to (lens, camera-to-world pose (4, 4)).
+
+    The lens is that of the photograph at full size. Photographs without a pose are left out.
+    """
     cameras = {}
     for image, picture, scale in registered(model, pictures):
         f, cx, cy, radial = model.cameras[image.camera_id].params

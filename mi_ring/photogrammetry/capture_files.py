@@ -1,4 +1,4 @@
-"""Writes the capture: photographs cropped to the object, undistorted, with masks and lights."""
+"""Writes the files of a capture: undistorted photographs, cropped to the object, with masks and lights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ OBJECT, UNKNOWN = 255, 128  #: values of masks; the background is 0
 
 @dataclass(frozen=True)
 class PosedPicture:
-    """A photograph with its camera, light and masks."""
+    """A photograph with its camera, light and mask."""
 
     picture: Picture
     lens: Lens
@@ -43,10 +43,10 @@ class PosedPicture:
 
 
 def crop_windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]) -> list[Window]:
-    """Choose the window around the object in each photograph. `sizes`: (width, height) [px] of the photographs.
+    """Choose a window around the object in each photograph. `sizes`: (width, height) [px] of the photographs.
 
-    Photographs of one size get windows of one size, so that they are rendered together. Without any mask the window is
-    the whole photograph.
+    Photographs of one size get windows of one size, so that they can be rendered together. If none of these has a mask,
+    the windows are the whole photographs.
     """
     bounds = [None if mask is None else mask_bounds(mask, size) for mask, size in zip(masks, sizes)]
     windows = []
@@ -61,7 +61,7 @@ def crop_windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, 
 
 
 def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> Element:
-    """Write a photograph's crop and masks. Returns its XML element for the scene file."""
+    """Write the crop and the masks of a photograph. Returns the photograph's XML element for the scene file."""
     picture = posed.picture
     pixels = picture.pixels[..., :3]
     left, top, width, height = window[:4]
@@ -93,7 +93,7 @@ def write_table(
 ) -> list[Element]:
     """Write a texture of the table's albedo around `center` (3,).
 
-    Returns [XML element], or [] if no photograph shows it.
+    Returns a list with the XML element of the table. The list is empty if no photograph shows the table.
     """
 
     def observe(posed: PosedPicture) -> tuple[ReducedView, np.ndarray, Light]:
@@ -118,9 +118,9 @@ def write_table(
 
 
 def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the object's lowest and highest (column, row): (2, 2) [px of the photograph]. None if the mask is empty.
+    """Return the lowest and highest (column, row) of the object, (2, 2) [px of the photograph].
 
-    `size`: (width, height) [px] of the photograph.
+    `size`: (width, height) [px] of the photograph. Returns None if the mask is empty.
     """
     rows, columns = np.nonzero(mask == OBJECT)
     if not len(rows):
@@ -129,12 +129,15 @@ def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
 
 
 def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:
-    """Factor by which a photograph of `size` (width, height) [px] is larger than its mask."""
+    """Return how many times larger a photograph is than its mask. `size`: (width, height) [px] of the photograph."""
     return round(size[0] / mask.shape[1])
 
 
 def crop_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndarray:
-    """Enlarge a mask to the photograph's `size` (width, height) and crop it to a window: `OBJECT`, `UNKNOWN` or 0."""
+    """Enlarge a mask to its photograph, and crop it to a window. Its values are `OBJECT`, `UNKNOWN` and 0.
+
+    `size`: (width, height) [px] of the photograph.
+    """
     scale, (left, top, width, height) = reduction(mask, size), window[:4]
     to_mask = np.array([[1, 0, left + (1 - scale) / 2], [0, 1, top + (1 - scale) / 2]]) / scale
     is_object, is_unknown = (

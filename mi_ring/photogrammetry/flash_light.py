@@ -1,4 +1,4 @@
-"""Calibrates the flash, the room's light and the camera's response by the brightness of the sheet's white paper."""
+"""Calibrates the flash, the room's light and the camera's response from the brightness of the sheet's white paper."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -27,13 +27,16 @@ OTHER_MATERIAL = 0.1  #: the margin is not paper if its log intensity differs fr
 
 
 class ObjectSphere(NamedTuple):
-    """A sphere that approximates the object: it reflects light onto the paper and blocks room light."""
+    """A sphere that stands for the object. It reflects light onto the paper, and it blocks light of the room."""
 
     center: np.ndarray  #: (3,)
     radius: float
 
     def reflected(self, points: np.ndarray, lights: np.ndarray) -> np.ndarray:
-        """Irradiance (n,) that a white sphere reflects to `points` (n, 3), lit by `lights` (n, 3) of intensity 1."""
+        """Return the irradiance (n,) at `points` (n, 3) from light that a white sphere reflects.
+
+        `lights` (n, 3): for each point, the position of the light of intensity 1 that lights the sphere.
+        """
         up, to_light = self.center - points, lights - self.center
         distance = np.linalg.norm(to_light, axis=1)
         phase = np.arccos(np.clip(-(up * to_light).sum(1) / (np.linalg.norm(up, axis=1) * distance), -1, 1))
@@ -41,14 +44,14 @@ class ObjectSphere(NamedTuple):
         return 2 / 3 * lit * self.form_factor(points) / distance**2
 
     def form_factor(self, points: np.ndarray) -> np.ndarray:
-        """Form factors (n,) of the sphere, seen from `points` (n, 3) of the sheet."""
+        """Return the form factors (n,) of the sphere, seen from `points` (n, 3) of the sheet."""
         up = self.center - points
         distance = np.linalg.norm(up, axis=1)
         return ((self.radius / distance) ** 2 * np.maximum(up[:, 2], 0) / distance).clip(max=1)
 
 
 class FlashCalibration(NamedTuple):
-    """Estimated flash, room light and camera response, in the sheet's frame [mm]. Camera axes are OpenCV's."""
+    """The estimated flash, room light and camera response, in the sheet's frame [mm]. Camera axes are OpenCV's."""
 
     offset: np.ndarray  #: (3,) position of the flash relative to the lens, in the axes of `turn_with_cameras` [mm]
     falloff: float  #: exponent of the cone: intensity is proportional to cosine ^ falloff, from the optical axis
@@ -64,10 +67,11 @@ class FlashCalibration(NamedTuple):
 
 
 def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, falloff: float) -> np.ndarray:
-    """Irradiance (n,) at n surface points from a flash of intensity 1; 0 where the flash is behind the surface.
+    """Return the irradiance (n,) at n surface points from a flash of intensity 1.
 
-    `to_light` (n, 3): vectors from the points to the flash. `normal` (3,): surface normal. `forward` (3,) or (n, 3):
-    axis of the flash. `falloff`: exponent of the cosine about this axis.
+    It is 0 where the flash is behind the surface. `to_light` (n, 3): vectors from the points to the flash. `normal`
+    (3,): surface normal. `forward` (3,) or (n, 3): axis of the flash. `falloff`: exponent of the cosine about this
+    axis.
     """
     distance = np.linalg.norm(to_light, axis=1)
     cosine = np.maximum(-(to_light * forward).sum(1) / distance, MIN_FLASH_COSINE)
@@ -95,7 +99,10 @@ class FlashParameters(NamedTuple):
     power: np.ndarray  #: logarithms
 
     def intensities(self, seen: Observations, sphere: ObjectSphere | None) -> np.ndarray:
-        """Log intensity (n, 3) of the flash, computed from each of the n samples `seen` alone."""
+        """Return the log intensity (n, 3) of the flash, as each of the n samples in `seen` gives it on its own.
+
+        `sphere`: stands for the object; None: no object.
+        """
         to_light, room = seen.poses[:, :3, 3] + seen.axes @ self.offset - seen.points, self.room
         light = irradiance(to_light, np.array([0.0, 0, 1]), seen.poses[:, :3, 2], self.falloff)[:, None]
         if sphere:
@@ -108,14 +115,16 @@ def calibrate_flash(
     papers: Mapping[str, PaperSamples], poses: Mapping[str, np.ndarray], axes: Mapping[str, np.ndarray],
     exposures: Mapping[str, float], offset: np.ndarray, sphere: ObjectSphere | None = None, curved: bool = True,
 ) -> FlashCalibration | None:  # fmt: skip
-    """Calibrate the flash from the brightness of white paper. None if no photograph shows the paper.
+    """Calibrate the flash from the brightness of white paper. Returns None if no photograph shows the paper.
 
-    By the photograph's name: `papers`; `poses` (4, 4); `axes` (3, 3), see `turn_with_cameras`; relative `exposures`,
-    NaN if unknown. `offset` (3,): approximate flash position relative to the camera. `curved`: also estimate the
-    camera's response.
+    The dicts have names of photographs as keys. `papers`: samples of the paper. `poses`: (4, 4). `axes`: (3, 3), see
+    `turn_with_cameras`. `exposures`: relative, NaN if unknown. `offset` (3,): approximate position of the flash
+    relative to the camera. `sphere`: stands for the object; None: no object. `curved`: also estimate the camera's
+    response.
 
-    Robust least squares of log brightness, with the priors above, estimates the `FlashParameters` and each photograph's
-    intensity. The margin is used only if it is as bright as the squares. A nearly linear response is taken as linear.
+    The method is robust least squares of log brightness, with the priors above. It estimates the `FlashParameters`, and
+    the intensity of each photograph. Samples in the margin are used only if they are as bright as the squares. If the
+    response is nearly linear, it is set to linear.
     """
     names = [n for n in papers if n in poses and not papers[n].in_margin.all() and poses[n][2, 3] > 0]
     if not names:
@@ -149,10 +158,10 @@ def fit_parameters(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], offset: np.ndarray,
     sphere: ObjectSphere | None, curved: bool,
 ) -> FlashParameters:  # fmt: skip
-    """Estimate the unknowns that photographs share, from at most `MAX_PHOTOGRAPHS`.
+    """Estimate the unknowns that all photographs share. At most `MAX_PHOTOGRAPHS` photographs are used.
 
-    Other arguments: see `calibrate_flash`. `prior`: (log exposures (count,) of the photographs, their standard
-    deviations (count,)).
+    `observations`: one per photograph. `prior`: (log exposures, their standard deviations), each (count,) for the
+    photographs. Other arguments: see `calibrate_flash`.
     """
     some = evenly_spaced(len(observations), MAX_PHOTOGRAPHS)
     exposures, deviations = (part[some, None] for part in prior)
@@ -192,7 +201,10 @@ def fit_intensities(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], parameters: FlashParameters,
     sphere: ObjectSphere | None,
 ) -> np.ndarray:  # fmt: skip
-    """Estimate log intensities (count, 3) of the flash in each photograph, robustly. `prior`: see `fit_parameters`."""
+    """Return robust estimates of the log intensity of the flash in each photograph, (count, 3).
+
+    `prior`: see `fit_parameters`.
+    """
     result = []
     for seen, exposure, deviation in zip(observations, *prior):
         single, expected = parameters.intensities(seen, sphere), exposure + parameters.power

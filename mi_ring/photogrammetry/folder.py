@@ -29,31 +29,32 @@ DECODED = 2  #: photographs that are decoded at a time: each may take 500 MB
 
 @dataclass(frozen=True)
 class Picture:
-    """A photograph in a file."""
+    """A photograph in a file. Its pixels and EXIF data are read when they are used."""
 
     path: Path
     upright: bool = True  #: turn the pixels by the EXIF orientation; cameras of other tools need them as stored
 
     @property
     def name(self) -> str:
-        """The file's name without suffix."""
+        """Name of the file without suffix."""
         return self.path.stem
 
     @property
     def suffix(self) -> str:
-        """The file's suffix, lower case."""
+        """Suffix of the file in lower case."""
         return self.path.suffix.lower()
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """Upright pixels (H, W, C) uint8 or uint16; see `encoding`. Raises InputError if the file cannot be read.
+        """Pixels (H, W, C) uint8 or uint16. They are turned upright if `upright` is set. See also `encoding`.
 
-        Floats become uint16: 1 is full scale, and larger values are clipped.
+        Floats become uint16: 1 is full scale, and larger values are clipped. Raises InputError if the file cannot be
+        read.
         """
         return oriented(self.stored(), self.orientation)
 
     def stored(self) -> np.ndarray:
-        """Pixels as the file stores them, not yet rotated upright."""
+        """Read the pixels as the file stores them. They are not turned upright."""
         pixels = read_as(self.path, "photograph", partial(read_image, heed=True))
         if pixels.dtype == np.float32:
             if not np.isfinite(pixels).all():
@@ -63,13 +64,13 @@ class Picture:
 
     @property
     def mask_pixels(self) -> np.ndarray:
-        """Read this file as a mask (H, W) uint8; rotated upright if `pixels` are."""
+        """The file, read as a mask (H, W) uint8. It is turned in the same way as `pixels`."""
         return oriented(mask_values(read_as(self.path, "mask", read_image)), self.orientation)
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
-        """Open the file and return `read(opened)`.
+        """Open the file, and return the result of `read(opened)`.
 
-        Raw files are opened by LibRaw, others by Pillow, which rotates HEIF upright.
+        LibRaw opens raw files. Pillow opens all others, and turns HEIF upright.
         """
         raw = self.suffix in RAW
         with (
@@ -80,7 +81,7 @@ class Picture:
 
     @cached_property
     def camera_orientation(self) -> int:
-        """EXIF orientation in which the camera was held. HEIF pixels are already rotated by it."""
+        """EXIF orientation of the camera when it took the photograph, 1 to 8."""
         if self.suffix in HEIF:
             return self.decode(lambda image: image.info.get("original_orientation") or 1)
         if self.suffix in RAW:
@@ -90,7 +91,10 @@ class Picture:
 
     @property
     def orientation(self) -> int:
-        """EXIF orientation by which `stored` must be rotated; 1 (none) for HEIF, which is already rotated when read."""
+        """EXIF orientation by which `stored` must be turned; 1 (none) if `upright` is not set.
+
+        It is also 1 for HEIF, because its reader has turned the pixels already.
+        """
         return self.camera_orientation if self.upright and self.suffix not in HEIF else 1
 
     @property
@@ -100,19 +104,19 @@ class Picture:
 
     @cached_property
     def exif(self) -> Image.Exif:
-        """The EXIF data; empty if there is none or it cannot be read."""
+        """EXIF data. Empty if there are none, or if they cannot be read."""
         try:
             return exif_of(self.path)
         except Exception:  # damaged data raise many kinds; Pillow does not know all raw formats
             return Image.Exif()
 
     def exif_field(self, tag: int) -> Any:
-        """Value of the tag number `tag` in the Exif part of the EXIF data; None if missing."""
+        """Return the value of the tag number `tag` in the Exif part of the EXIF data. Returns None if it is missing."""
         return self.exif.get_ifd(ExifTags.IFD.Exif).get(tag)
 
     @property
     def raw(self) -> bool:
-        """Test whether it is a raw file: linear pixels of arbitrary brightness."""
+        """True for a raw file. Its pixels are linear, and their brightness is arbitrary."""
         return self.suffix in RAW
 
     @cached_property
@@ -127,14 +131,17 @@ class Picture:
         return size[::-1] if self.orientation > 4 else size
 
     def grey(self, longest: int) -> np.ndarray:
-        """Grey pixels (h, w) uint8 for features: block means, at most `longest` pixels along the longer side."""
+        """Return grey pixels (h, w) uint8, in which features are searched. They are reduced by block means.
+
+        `longest`: largest length of the longer side [px].
+        """
         rgb = self.srgb()
         scale = -(-max(rgb.shape[:2]) // longest)
         height, width = (n // scale * scale for n in rgb.shape[:2])
         return np.array(Image.fromarray(rgb[:height, :width]).convert("L").reduce(scale))
 
     def srgb(self) -> np.ndarray:
-        """The photograph as sRGB, (H, W, 3) uint8."""
+        """Return the photograph as sRGB, (H, W, 3) uint8."""
         rgb = self.pixels[:, :, :3]
         if rgb.dtype == np.uint8:
             return rgb
@@ -144,21 +151,25 @@ class Picture:
 
     @cached_property
     def white(self) -> float:
-        """Raw value that is displayed as white (1 = full scale), because the brightness of raw files is arbitrary."""
+        """Value of `pixels` that is shown as white (1 = full scale).
+
+        It is needed because the brightness of raw files is arbitrary. For other files, it is 1.
+        """
         if not self.raw:
             return 1.0
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
     def to_linear(self, pixels: np.ndarray) -> np.ndarray:
-        """Convert a part of `pixels` without alpha to linear radiance (H, W, 3) float32; 1.0 = full scale."""
+        """Convert a part of `pixels`, without alpha, to linear radiance (H, W, 3) float32. 1.0 is full scale."""
         value = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=np.float32) / np.iinfo(pixels.dtype).max
         return (value if self.encoding == "linear" else srgb_to_linear(value))[pixels]
 
     def mask(self, source: str | Path) -> np.ndarray | None:
-        """Read the user's mask (H, W) uint8, 255 on the object; None if this photograph has none.
+        """Return the user's mask (H, W) uint8, 255 on the object. Returns None if this photograph has none.
 
-        `source`: "alpha": take the alpha channel; "rembg": call that package; else a folder of masks, see `mask_file`.
-        Raises InputError if the mask cannot be read or differs in size.
+        `source`: "alpha": the mask is the alpha channel. "rembg": the package rembg makes it. Otherwise, `source` is a
+        folder of masks, see `mask_file`. Raises InputError if the mask cannot be read, or if its size is not that of
+        the photograph.
         """
         if source == "rembg":
             return np.array(rembg()(Image.fromarray(self.srgb())))
@@ -176,41 +187,49 @@ class Picture:
         return (mask // (np.iinfo(mask.dtype).max // 255)).astype(np.uint8)
 
     def mask_file(self, folder: Path) -> Path | None:
-        """Find the mask file in `folder` that is named after this photograph; None if there is none."""
+        """Return the mask file of this photograph in `folder`. For photo.jpg, it is photo.jpg.png or photo.png.
+
+        Other image formats are possible, too. Returns None if there is no such file.
+        """
         suffixes = [own for suffix in (".png", *SUFFIXES) for own in (suffix, suffix.upper())]
         files = (folder / f"{name}{suffix}" for name in (self.path.name, self.name) for suffix in suffixes)
         return next((file for file in files if file.is_file()), None)
 
     def close(self) -> None:
-        """Drop cached pixels to free memory."""
+        """Drop the cached pixels to free memory. The next use reads them again."""
         self.__dict__.pop("pixels", None)
 
 
 @cache
 def rembg() -> Callable[[Image.Image], Image.Image]:
-    """Load rembg's network and return its mask function. Raises InputError if rembg is not installed."""
+    """Load rembg's network. Returns the function that makes a mask. Raises InputError if rembg is not installed."""
     package = need("rembg", "--masks rembg")
     return partial(package.remove, session=package.new_session(), only_mask=True)
 
 
 def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
-    """Convert a vector that is fixed to the camera body to the pixel axes of each photograph: vectors by name.
+    """Convert a vector that is fixed to the camera to the pixel axes of each photograph. Returns vectors by name.
 
-    `vector`: (3,), or (3, n) for n vectors, in the axes of upright photographs with the most frequent orientation.
+    The camera may have been held in several orientations. `vector`: (3,), or (3, n) for n vectors. Its axes are those
+    of an upright photograph with the most frequent orientation.
     """
     usual, _ = Counter(picture.camera_orientation for picture in pictures).most_common(1)[0]
     return {p.name: p.axes @ orientation_axes(usual).T @ vector for p in pictures}
 
 
 def up_directions(pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
-    """Up direction (3,) of each photograph when displayed upright, in its own pixel axes; by the photograph's name."""
+    """Return the up direction (3,) of each photograph in its own pixel axes: a dict by the photograph's name.
+
+    Up is the direction that points up when the photograph is shown upright.
+    """
     return {p.name: p.axes @ orientation_axes(p.camera_orientation).T @ [0, -1, 0] for p in pictures}
 
 
 def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
     """List the photographs in a folder, sorted by name. `upright`: see `Picture`.
 
-    Raises InputError if the folder is missing, if a name cannot be used, or if photographs are too few or identical.
+    Raises InputError if the folder is missing, if a file name cannot be used, if there are too few photographs, or if
+    two of them are the same.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: FOLDER: {'is a file' if folder.exists() else 'no such folder'}; give the folder "
@@ -244,36 +263,45 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
 
 
 def focal_35mm(pictures: Sequence[Picture]) -> float | None:
-    """Find the 35 mm equivalent focal length [mm]: the first in EXIF data; None if no photograph has one."""
+    """Return the first 35 mm equivalent focal length [mm] in the EXIF data of the photographs; None without any."""
     values = (picture.exif_field(ExifTags.Base.FocalLengthIn35mmFilm) for picture in pictures)
     return next((float(value) for value in values if isinstance(value, int | float) and value > 0), None)
 
 
 def without_exposure(pictures: Sequence[Picture]) -> list[str]:
-    """List the file names of photographs that lack an exposure in EXIF data; empty if all lack it."""
+    """Return the file names of photographs without an exposure in their EXIF data.
+
+    If no photograph has an exposure, the list is empty.
+    """
     missing = [p.path.name for p, exposure in zip(pictures, exif_exposures(pictures)) if np.isnan(exposure)]
     return missing if len(missing) < len(pictures) else []
 
 
 def exif_exposures(pictures: Sequence[Picture]) -> np.ndarray:
-    """Compute exposure time · ISO / aperture² (N,) from EXIF data; NaN if unknown. A tag that all lack is left out."""
+    """Return exposure time · ISO / aperture² (N,) of the photographs by EXIF data. It is NaN if it is unknown.
+
+    If no photograph has one of the three values, this value is taken as 1.
+    """
     return np.array(exposures_of([picture.exif.get_ifd(ExifTags.IFD.Exif) for picture in pictures]))
 
 
 def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.ndarray:
-    """Exposures (N,) by EXIF data, divided by their median. Photographs without one get the value `unknown`."""
+    """Return the exposures (N,) by EXIF data, divided by their median. `unknown`: value for photographs without one."""
     exposures = exif_exposures(pictures)
     known = np.isfinite(exposures)
     return np.where(known, exposures / np.median(exposures[known]) if known.any() else 1.0, unknown)
 
 
 def without_flash(pictures: Sequence[Picture]) -> list[str]:
-    """List the files of photographs whose flash did not fire, by EXIF data; empty unless it fired in most of them."""
+    """Return the file names of photographs whose flash did not fire, by EXIF data.
+
+    The list is empty if the flash fired in only half of the photographs or fewer.
+    """
     fired = [picture.exif_field(ExifTags.Base.Flash) for picture in pictures]
     off = [p.path.name for p, value in zip(pictures, fired) if isinstance(value, int) and not value & 1]
     return off if sum(isinstance(value, int) and value & 1 for value in fired) > len(pictures) / 2 else []
 
 
 def camera_names(pictures: Sequence[Picture]) -> dict[str, int]:
-    """Count the photographs of each camera model in EXIF data."""
+    """Return the camera models in the EXIF data: a dict from the model to its number of photographs."""
     return dict(Counter(str(m) for picture in pictures if (m := picture.exif.get(ExifTags.Base.Model))))

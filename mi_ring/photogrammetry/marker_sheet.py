@@ -1,4 +1,4 @@
-"""The printed sheet of ChArUco markers: its page, its corners and white paper in photographs, poses and scale."""
+"""The printed sheet of ChArUco markers: draws it, finds it in photographs, samples its paper, computes poses."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Literal, NamedTuple
@@ -62,13 +62,13 @@ class Similarity(NamedTuple):
 
 
 def charuco() -> cv2.aruco.CharucoBoard:
-    """The sheet as OpenCV's ChArUco board."""
+    """Return the sheet as a ChArUco board of OpenCV."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
     return cv2.aruco.CharucoBoard((COLUMNS, ROWS), SQUARE, MARKER * SQUARE, dictionary)
 
 
 def page(paper: Literal["a4", "letter"]) -> Image.Image:
-    """Draw the sheet for printing, with `DOTS` pixels per mm and a line that says what to measure."""
+    """Draw the page to print: the sheet, and below it a line that says what to measure. It has `DOTS` pixels per mm."""
     size = DOTS * SQUARE * np.array([COLUMNS, ROWS])
     sheet = Image.new("1", (round(DOTS * PAPERS[paper][0]), round(DOTS * PAPERS[paper][1])), 1)
     left, top = ((np.array(sheet.size) - size) // 2).tolist()
@@ -79,7 +79,7 @@ def page(paper: Literal["a4", "letter"]) -> Image.Image:
 
 
 class MarkerSheet:
-    """The printed sheet. `square`: side length of the squares [mm]."""
+    """The printed sheet, with a detector for its corners. `square`: side length of the squares [mm]."""
 
     def __init__(self, square: float = SQUARE) -> None:
         self.square = square
@@ -91,7 +91,7 @@ class MarkerSheet:
         self.detector = cv2.aruco.CharucoDetector(charuco(), params)
 
     def detect(self, picture: np.ndarray) -> SheetDetection | None:
-        """Find the sheet's corners in a photograph (H, W, 3) or (H, W) uint8; None if it shows too few."""
+        """Find the sheet's corners in a photograph (H, W, 3) or (H, W) uint8. Returns None if it shows too few."""
         grey = picture if picture.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
         scale = -(-max(grey.shape) // LONGEST)
         height, width = (side // scale for side in grey.shape)
@@ -116,7 +116,10 @@ class MarkerSheet:
         return SheetDetection(ids, points, pixels)
 
     def pitch(self, points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Shorter side (n,) [px] of the square at each of n corners. `points` (n, 3): on the sheet; `pixels` (n, 2)."""
+        """Return the length (n,) [px] of a square's shorter side at each of n corners.
+
+        `points` (n, 3): the corners on the sheet. `pixels` (n, 2): the same corners in the photograph.
+        """
         plane, _ = cv2.findHomography(points[:, :2], pixels, cv2.RANSAC, 0.05 * np.ptp(pixels, 0).max())
         if plane is None:
             return np.zeros(len(points))
@@ -128,7 +131,7 @@ class MarkerSheet:
 
 
 def are_collinear(points: np.ndarray) -> bool:
-    """Test whether points (n, 3) are nearly on one line."""
+    """Return whether points (n, 3) are nearly on one line."""
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(values[1] <= 0.01 * values[0])
 
@@ -136,8 +139,9 @@ def are_collinear(points: np.ndarray) -> bool:
 def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict[str, Pose], dict[str, float]]:
     """Calibrate photographs of one `size` (width, height) [px] by the sheet alone.
 
-    Returns (lens, poses [mm] by name, RMS reprojection errors [px] by name). The lens is SIMPLE_RADIAL with a central
-    principal point. Photographs that do not fit are left out. Raises InputError if fewer than three fit.
+    Returns (lens, poses [mm], RMS reprojection errors [px]). The last two are dicts by the photograph's name. The lens
+    is SIMPLE_RADIAL with its principal point in the middle. Photographs that do not fit are left out. Raises InputError
+    if fewer than three fit.
     """
     names = list(detections)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_PRINCIPAL_POINT
@@ -164,7 +168,7 @@ def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict
 
 
 def align(detections: Detections, cameras: Cameras) -> Similarity:
-    """Estimate the similarity from the cameras' frame to the sheet's frame.
+    """Estimate the similarity transform from the cameras' frame to the sheet's frame.
 
     Raises InputError if too few corners fit.
     """
@@ -217,9 +221,10 @@ class PaperSamples(NamedTuple):
 def sample_paper(
     photograph: np.ndarray, detection: SheetDetection, linear: Callable[[np.ndarray], np.ndarray] = np.asarray
 ) -> PaperSamples:
-    """Sample the white squares and the margin in a photograph (H, W, 3): median colours, none above `CLIPPED`.
+    """Sample the colours of the white squares and of the margin in a photograph (H, W, 3).
 
-    `linear`: function that decodes a part of the photograph to linear float32. Decoding all would need too much memory.
+    Each sample is a median. Samples above `CLIPPED` are left out. `linear`: function that decodes a part of the
+    photograph to linear float32. The whole photograph at once would need too much memory.
     """
 
     def sample(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
@@ -255,7 +260,7 @@ def sample_paper(
 def sample_colours(
     photograph: np.ndarray, linear: Callable[[np.ndarray], np.ndarray], points: np.ndarray, plane: np.ndarray
 ) -> np.ndarray:
-    """Sample a photograph (H, W, 3) at `points` (n, 2) of a plane: linear colours (n, 3), NaN outside the photograph.
+    """Return the linear colours (n, 3) of a photograph (H, W, 3) at `points` (n, 2) of a plane; NaN outside of it.
 
     `plane` (3, 3): homography from the plane to pixels. `linear`: see `sample_paper`.
     """

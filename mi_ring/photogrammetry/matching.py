@@ -1,4 +1,4 @@
-"""Features of the photographs by COLMAP's library, and matches between them by matrix products."""
+"""Finds image features with COLMAP's library, and matches them between photographs with matrix products."""
 
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -38,12 +38,15 @@ STATIC, MAX_STATIC = 0.01, 0.9
 
 
 def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Write reduced grey images to `folder`, and their features to the database. Existing ones are kept."""
+    """Write reduced grey images to the folder `folder`/grey, and their features to `folder`/database.db.
+
+    Images that have features in the database already are skipped.
+    """
     list(progress(extract_features(pictures, folder), "features", len(pictures)))
 
 
 def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Picture]:
-    """Like `find_features`; yields each photograph when its features are in the database."""
+    """Do the same as `find_features`, and yield each photograph when its features are in the database."""
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=cores())
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
     database, grey = folder / "database.db", folder / "grey"
@@ -73,17 +76,20 @@ def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Pict
 
 
 def batches(things: Sequence[Any], count: int) -> Iterator[Sequence[Any]]:
-    """Split a sequence into parts of `count` items."""
+    """Split a sequence into parts of `count` items. The last part may be shorter."""
     return (things[k : k + count] for k in range(0, len(things), count))
 
 
 def grey_file(picture: Picture) -> str:
-    """File name of the photograph's grey image, without spaces, which separate names in COLMAP's lists of pairs."""
+    """Return the file name of the photograph's grey image.
+
+    It has no spaces, because COLMAP's lists of pairs separate names by spaces.
+    """
     return f"{quote(picture.name, safe='')}.png"
 
 
 def camera_ids(database: Path) -> dict[str, int]:
-    """Camera ids of the images in COLMAP's database, by file name; empty if there is no database."""
+    """Return the camera ids of the images in COLMAP's database: a dict by file name. Empty if there is no database."""
     if not database.is_file():
         return {}
     with pycolmap.Database.open(database) as opened:
@@ -100,7 +106,7 @@ class Features(NamedTuple):
 
 
 def read_features(database: Path) -> dict[str, Features]:
-    """Read the features of all images in COLMAP's database, by file name."""
+    """Read the features of all images in COLMAP's database. Returns a dict by file name."""
     with pycolmap.Database.open(database) as opened:
         cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
         return {
@@ -113,10 +119,10 @@ def read_features(database: Path) -> dict[str, Features]:
 
 
 def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Find for each descriptor (n, 128) the nearest of the `others` (m, 128). Returns (indices (n,), ratios (n,)).
+    """Find, for each descriptor (n, 128), the nearest of the `others` (m, 128). Returns (indices (n,), ratios (n,)).
 
-    Ratio: angle to the nearest divided by angle to the second nearest; infinite if the nearest is too far for a match.
-    Products of integers are exact in float32.
+    A ratio is the angle to the nearest one, divided by the angle to the second nearest one. It is infinite if the
+    nearest one is too far for a match. Products of integers are exact in float32.
     """
     others = torch.cat([others.float(), torch.zeros(1, others.shape[1])])  # the second nearest one if there is only one
     buffer, found = torch.empty(BLOCK, len(others)), []  # new memory for each block would take longer than its product
@@ -130,9 +136,10 @@ def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tens
 
 
 def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Find mutual nearest neighbours of descriptors (n, 128), (m, 128).
+    """Find descriptors (n, 128) and (m, 128) that are nearest to each other.
 
-    Returns (index pairs (k, 2) uint32, ratios (k,)). A ratio is the larger of both directions, and less than `LOOSE`.
+    Returns (index pairs (k, 2) uint32, ratios (k,)). Each pair has a ratio in both directions, see `nearest`. The
+    larger one is returned, and it is less than `LOOSE`.
     """
     there, ratio = nearest(first, second)
     rows = (ratio < LOOSE).nonzero()[:, 0]
@@ -144,10 +151,10 @@ def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.nda
 
 
 def match_pair(first: Features, second: Features) -> Any:
-    """Estimate the two-view geometry of two images by COLMAP, with all matches that agree with it.
+    """Estimate the two-view geometry of two images with COLMAP. Returns it with all matches that agree with it.
 
-    The ratio test finds the geometry. Among matches that agree with the geometry few are wrong even if their ratio is
-    near 1 (two similar features on an object, say), so these are kept as well.
+    The geometry is found from the matches that pass the ratio test. Then other matches are added if they agree with it.
+    Few of these are wrong, even if their ratio is near 1, for example for two similar features on an object.
     """
     matches, ratios = match_descriptors(first.descriptors, second.descriptors)
     geometry = pycolmap.estimate_two_view_geometry(
@@ -160,16 +167,17 @@ def match_pair(first: Features, second: Features) -> Any:
 
 
 def verification() -> Any:
-    """Options of COLMAP's geometric verification, whose result does not depend on the thread."""
+    """Return options of COLMAP's geometric verification. With these, its result does not depend on the thread."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     return options
 
 
 def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Residuals [px] of matches (k, 2) [px] with respect to a two-view geometry: (k,).
+    """Return the residuals (k,) [px] of k matches in a two-view geometry. `first`, `second`: their points (k, 2) [px].
 
-    For a homography: distance from the mapped first point. Otherwise: Sampson distance from the epipolar line.
+    For a homography, it is the distance from the mapped first point. Otherwise it is the Sampson distance from the
+    epipolar line.
     """
     kinds = pycolmap.TwoViewGeometryConfiguration
     if geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
@@ -179,10 +187,11 @@ def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarra
 
 
 def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]:
-    """Choose the pairs of photographs to match. `descriptors` (n, 128) of each, sorted by the photograph's name.
+    """Choose which pairs of photographs are matched. Returns pairs of indices.
 
-    Of many photographs, only similar ones and neighbours are paired. Similar photographs show the same visual words
-    (Sivic and Zisserman, "Video Google", 2003). The words are descriptors drawn from all photographs.
+    `descriptors`: (n, 128) for each photograph, sorted by the photograph's name. If there are many photographs, only
+    similar ones and neighbours are paired. Similar photographs show the same visual words (Sivic and Zisserman, "Video
+    Google", 2003). The words are descriptors drawn from all photographs.
     """
     pairs = list(itertools.combinations(range(len(descriptors)), 2))
     if len(descriptors) <= ALL_PAIRS:
@@ -199,12 +208,18 @@ def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]
 
 
 def count_words(descriptors: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
-    """Histogram (m + 1,) of descriptors (n, 128) by the nearest of m `words` (m, 128). The last bin is for no match."""
+    """Return how many of the descriptors (n, 128) are nearest to each of m `words` (m, 128): a histogram (m + 1,).
+
+    The last bin counts descriptors that match no word.
+    """
     return torch.bincount(nearest(descriptors, words)[0], minlength=len(words) + 1)
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Match the image pairs that the database lacks. Raises InputError if the first batch is from one viewpoint."""
+    """Match the pairs of photographs that the database lacks, and write the matches there.
+
+    Raises InputError if most pairs of the first batch are from one viewpoint.
+    """
     features = read_features(folder / "database.db")
     files = [grey_file(picture) for picture in pictures]
     pairs = [(files[a], files[b]) for a, b in pairs_to_match([features[file].descriptors for file in files])]
@@ -219,7 +234,10 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
 def match_pairs(
     pairs: Sequence[tuple[str, str]], features: Mapping[str, Features], folder: Path
 ) -> Iterator[tuple[str, str]]:
-    """Match pairs of files; yields each when its two-view geometry is in the database. Existing ones are kept."""
+    """Match pairs of files. Yields each pair when its two-view geometry is in the database.
+
+    A pair that has a geometry there already is not matched again.
+    """
     with pycolmap.Database.open(folder / "database.db") as opened:
         for batch in batches(pairs, BATCH):
             both = [(features[a], features[b]) for a, b in batch]
@@ -230,9 +248,10 @@ def match_pairs(
 
 
 def match_again(files: Collection[str], folder: Path, progress: Progress) -> bool:
-    """Match the matched pairs of these files again, by guided matching. Returns whether there was such a pair.
+    """Match pairs again by guided matching: those that have matches and one of these files.
 
-    Guided matching searches along the epipolar lines only. It finds more matches, and more wrong ones.
+    Guided matching searches only along the epipolar lines. It finds more matches, but also more wrong ones. Returns
+    whether there was such a pair.
     """
     database = folder / "database.db"
     pairs = [(a.name, b.name) for a, b, first, _ in read_matches(database)
@@ -248,7 +267,10 @@ def match_again(files: Collection[str], folder: Path, progress: Progress) -> boo
 
 
 def match_by_library(pairs: Sequence[tuple[str, str]], folder: Path, guided: bool = True) -> None:
-    """Match pairs of files by COLMAP's own matcher, `guided` or not, and write the result to its database."""
+    """Match pairs of files by COLMAP's own matcher, and write the result to its database.
+
+    `guided`: search once more along the epipolar lines.
+    """
     listed = folder / "pairs.txt"
     listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), "utf-8")
     options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=guided)
@@ -257,7 +279,10 @@ def match_by_library(pairs: Sequence[tuple[str, str]], folder: Path, guided: boo
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
-    """Share of the `pairs` of grey files that match and are from one viewpoint: all features move alike."""
+    """Return the share of the `pairs` of grey files that match and are from one viewpoint.
+
+    If two photographs are from one viewpoint, all features move alike between them.
+    """
     with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
     asked, static = set(map(frozenset, pairs)), 0
@@ -270,9 +295,9 @@ def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
 
 
 def read_matches(database: Path) -> Iterator[tuple[Any, Any, np.ndarray, np.ndarray]]:
-    """Read COLMAP's database.
+    """Read all matched pairs of images in COLMAP's database.
 
-    Yields (image, image, points (n, 2) [px] in the first, in the second) for each matched pair.
+    Yields (first image, second image, points (n, 2) [px] in the first, the same points in the second).
     """
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}

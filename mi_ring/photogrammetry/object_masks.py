@@ -36,7 +36,7 @@ WIDE = 2.0  #: half size of the table's texture from whole photographs [half siz
 
 
 class SegmentedObject(NamedTuple):
-    """The segmented object: masks, position and size, and the table."""
+    """The segmented object: its masks, its position, its mean radiance, and the table."""
 
     masks: dict[str, np.ndarray]  #: (H, W) uint8 of `OBJECT`, `UNKNOWN` and 0, by the photograph's name
     center: np.ndarray  #: (3,)
@@ -53,16 +53,17 @@ class SegmentationInput(NamedTuple):
     sheet: bool = False  #: is `plane` that of the printed sheet?
 
     def digest(self) -> str:
-        """Hash of the mask source, to notice changes. For a folder: of file names, sizes and times."""
+        """Return a hash of the source of masks, to notice changes. For a folder: of file names, sizes and times."""
         if not isinstance(self.masks, Path):
             return self.masks
         files = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(self.masks.iterdir()) if f.is_file()]
         return hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
 
     def allows(self, points: np.ndarray, camera_distance: float, flatness: float = 2 * FLATNESS) -> np.ndarray:
-        """Test which points (N, 3) may belong to the object: (N,) bool.
+        """Return which points (N, 3) may belong to the object: (N,) bool.
 
-        They must be in the box, and at least `flatness` · `camera_distance` above the table.
+        They must be in the box, if there is one. If there is a table, they must be at least `flatness` ·
+        `camera_distance` above it.
         """
         allowed = np.ones(len(points), bool)
         if self.plane:
@@ -76,9 +77,10 @@ class SegmentationInput(NamedTuple):
 def find_object(
     pictures: Sequence[Picture], sparse: SparseModel, known: SegmentationInput, folder: Path, progress: Progress
 ) -> SegmentedObject:
-    """Segment the object in all photographs. Masks that exist in `folder` are reused: the user may have edited them.
+    """Segment the object in all photographs that have a camera. The masks are written to `folder`.
 
-    Raises InputError if the existing masks were made with other cameras or another `known`, or if no object is found.
+    If `folder` has masks already, these are used, because the user may have edited them. Raises InputError if they were
+    made with other cameras or another `known`. Also raises InputError if no object is found.
     """
     folder.mkdir(exist_ok=True)
     record = folder / "object.json"
@@ -115,7 +117,11 @@ def find_object(
 
 
 def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarray]:
-    """Read `SegmentedObject.masks` from a folder. Raises InputError if there are none or a size is wrong."""
+    """Read the masks in a folder. Returns a dict from names of photographs to masks, as in `SegmentedObject.masks`.
+
+    The file of a mask has the name of its photograph. A photograph without such a file is left out. Raises InputError
+    if there is no file at all, or if the size of a mask is not that of its photograph divided by a whole number.
+    """
     found = {}
     for picture in pictures:
         file = folder / f"{picture.name}.png"
@@ -135,9 +141,9 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
 def given_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """Read the user's masks and find the object by them. Returns (object, masks by the photograph's name).
+    """Read the user's masks, and find the object by them. Returns (object, masks by the photograph's name).
 
-    Raises InputError if masks are too few or disagree.
+    Raises InputError if there are too few masks, or if they disagree.
     """
     masks = {}
     for picture in progress(pictures, "masks"):
@@ -169,7 +175,10 @@ def require_half(count: int, pictures: Sequence[Picture], source: str | Path) ->
 
 
 def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
-    """Mask (H, W) uint8 of the box that the object is in; all 1 if the box reaches behind the camera."""
+    """Return a mask (H, W) uint8 in a camera's view: 1 on the box that contains the object.
+
+    If the box reaches behind the camera, the mask is 1 everywhere.
+    """
     pixels, depth = camera.project(np.array(list(itertools.product(*np.reshape(box, (3, 2))))))
     if depth.min() <= 0:  # a corner is behind the camera
         return np.ones(camera.size[::-1], np.uint8)
@@ -180,9 +189,9 @@ def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
 def find_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """Segment the object. Returns (object, masks by the photograph's name), without unclear masks.
+    """Segment the object. Returns (object, masks by the photograph's name). Unclear masks are left out.
 
-    Raises InputError if no object is found or too few masks agree.
+    Raises InputError if no object is found, or if too few masks agree.
     """
     folder = pictures[0].path.parent
     found = locate_object(grid, sparse.points, known, progress)
@@ -217,9 +226,9 @@ def refine_object(
     views: Views, found: VoxelObject, whole: VoxelGrid, known: SegmentationInput, settings: RefinementSettings,
     progress: Progress,
 ) -> Segmentation | None:  # fmt: skip
-    """Refine the masks of the object `found` in enlarged views around it. None if the masks disagree.
+    """Refine the masks of the object `found` in `views`, which show it enlarged. Returns None if the masks disagree.
 
-    `whole`: the grid with views of whole photographs.
+    `whole`: grid with the views of whole photographs.
     """
     grid = VoxelGrid.around(views, found)
     grid.allowed = known.allows(grid.points, grid.camera_distance, FLATNESS / 2)
@@ -239,10 +248,11 @@ def refine_object(
 def locate_object(
     grid: VoxelGrid, points: np.ndarray, known: SegmentationInput, progress: Progress
 ) -> VoxelObject | None:
-    """Locate the object by its difference from the table, its brightness, or a short fit; None if all three fail.
+    """Find the object by its difference from the table, else by its brightness, else by a short fit.
 
-    `points` (N, 3): sparse points, for the start of the fit. Brightness is not used with the sheet, whose paper is
-    bright, and not where a pixel shows the table's pattern, because the flash lights the table.
+    Returns None if all three fail. `points` (N, 3): sparse points, from which the fit starts. Brightness is not used
+    with the sheet, because its paper is bright. It is also not used at pixels that show the table's pattern, because
+    the flash lights the table, too.
     """
     grid.allowed = known.allows(grid.points, grid.camera_distance)
     table = known.plane and TableAppearance(grid.views, TexelGrid(known.plane, grid.center, grid.half_size), progress)

@@ -1,4 +1,4 @@
-"""Reduced, undistorted photographs with their cameras, in which the object is searched."""
+"""Photographs that are reduced and undistorted, with their cameras. The object is searched in these."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,7 +18,7 @@ MARGIN = 0.3  #: around the object in a window [size of the object]
 
 
 class ReducedView(NamedTuple):
-    """A photograph, or a window of one, that is reduced and undistorted."""
+    """A photograph, or a window of a photograph, after reduction and undistortion."""
 
     name: str
     rgb: np.ndarray  #: (H, W, 3) uint8 sRGB
@@ -31,9 +31,9 @@ class ReducedView(NamedTuple):
         return srgb_to_linear(np.arange(256, dtype=np.float32) / 255)[self.rgb]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points (N, 3).
+        """Project points (N, 3) to the view.
 
-        Returns (pixel rows (N,), pixel columns (N,), whether the view shows each point (N,)).
+        Returns (rows (N,), columns (N,), whether the view shows the point (N,)). Rows and columns are whole pixels.
         """
         projection, (width, height) = self.camera.projection.astype(np.float32), self.camera.size
         x, y, depth = projection[:, :3] @ points.astype(np.float32).T + projection[:, 3:]
@@ -49,7 +49,7 @@ Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, above 0 inside
 
 
 def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """Reduce an image (H, W, …) uint8 by area means and undistort it: the pixels (h, w, …) of a window."""
+    """Reduce an image (H, W, …) uint8 by area means, and undistort it. Returns the pixels (h, w, …) of a window."""
     height, width = (side // window.scale for side in image.shape[:2])
     whole = image[: height * window.scale, : width * window.scale]
     small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
@@ -58,7 +58,7 @@ def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation:
 
 
 def reduce_photograph(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> ReducedView:
-    """Reduce and undistort a window of a photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
+    """Make the view of a window of a photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
     rgb, camera = picture.srgb(), lens.camera(pose).shrunk(window.scale)
     corner = np.array([window.left, window.top]) / window.scale
     camera = camera._replace(centre=camera.centre - corner, size=(window.width, window.height))
@@ -70,7 +70,10 @@ def read_windows(
     pictures: Sequence[Picture], windows: Sequence[Sequence[Window]], cameras: Mapping[str, tuple[Lens, np.ndarray]],
     progress: Progress,
 ) -> list[list[ReducedView]]:  # fmt: skip
-    """Read each photograph and make the views of its windows. `cameras`: lens and pose by the photograph's name."""
+    """Read each photograph, and make the views of its windows. Returns a list of views for each photograph.
+
+    `windows`: a list for each photograph. `cameras`: lens and pose (4, 4) by the photograph's name.
+    """
 
     def read(picture: Picture, wanted: Sequence[Window]) -> list[ReducedView]:
         views = [reduce_photograph(picture, *cameras[picture.name], window) for window in wanted]
@@ -81,12 +84,18 @@ def read_windows(
 
 
 def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
-    """Undistort a photograph's mask (H, W) uint8 and reduce its longer side to at most `longest` px: (h, w), 0 or 1."""
+    """Undistort a photograph's mask (H, W) uint8, and reduce it. Returns (h, w) uint8, 0 or 1.
+
+    `longest`: largest length of the longer side [px].
+    """
     return (undistort_view(mask, lens, Window.whole(lens, longest)) > 127).astype(np.uint8)
 
 
 def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
-    """Choose the window around a mask (h, w) of the whole photograph, so that the mask is about `pixels` long in it."""
+    """Choose a window around the object in a photograph. `mask` (h, w): the object in the whole photograph.
+
+    `pixels`: about the length that the object gets in the window [px].
+    """
     rows, columns = np.nonzero(mask)
     size = np.array(lens.size)
     unit = np.round(size / mask.shape[::-1])
@@ -100,7 +109,10 @@ def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
 
 
 def paste_mask(mask: np.ndarray, lens: Lens, window: Window) -> np.ndarray:
-    """Paste a window's mask (h, w) into a mask of the whole photograph at the window's scale; 0 outside the window."""
+    """Paste a window's mask (h, w) into a mask of the whole photograph, which is 0 outside the window.
+
+    The result has the scale of the window.
+    """
     full = np.zeros((lens.size[1] // window.scale, lens.size[0] // window.scale), mask.dtype)
     left, top = window.left // window.scale, window.top // window.scale
     part = full[top : top + mask.shape[0], left : left + mask.shape[1]]

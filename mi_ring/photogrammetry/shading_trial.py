@@ -1,4 +1,4 @@
-"""Finds the object by its shading alone: a short fit without masks that starts from a sphere."""
+"""Finds the object by its shading alone. It runs a short fit without masks that starts from a sphere."""
 
 import numpy as np
 
@@ -20,9 +20,10 @@ SETTINGS = Config.preset("fast", iterations=ITERATIONS, levels=(4,), widths=(128
 
 
 def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> tuple[np.ndarray, float] | None:
-    """Find a sphere around most points (N, 3) near `center`.
+    """Find a sphere around most of those `points` (N, 3) that are near `center`.
 
-    Returns (centre (3,), radius); None if too few are near.
+    They are near if they are closer than `half_size`. Returns (centre (3,), radius), or None if too few points are
+    near.
     """
     near = points[np.linalg.norm(points - center, axis=1) < half_size]
     if len(near) < MIN_POINTS:
@@ -33,7 +34,7 @@ def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> 
 
 
 def shading_silhouettes(views: Views, center: np.ndarray, radius: float, progress: Progress) -> list[np.ndarray]:
-    """Run a short fit that starts from a sphere. Returns the object's mask in each view, (H, W) uint8.
+    """Run a short fit that starts from a sphere. Returns the object's mask (H, W) uint8 in each view, 1 on the object.
 
     Raises InputError if the fit diverges.
     """

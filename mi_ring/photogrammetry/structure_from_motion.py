@@ -52,17 +52,17 @@ class SparseModel:
     source: str = ""  #: where the cameras are from; empty: structure from motion
 
     def digest(self) -> str:
-        """Hash of the cameras, to notice changes."""
+        """Return a hash of the cameras, to notice changes."""
         cameras = [f"{name} {lens.model} {lens.params} {pose.round(6).tolist()}"
                    for name, (lens, pose) in sorted(self.cameras.items())]  # fmt: skip
         return hashlib.blake2b("\n".join(cameras).encode(), digest_size=8).hexdigest()
 
     def distance(self, point: np.ndarray) -> float:
-        """The median distance from the cameras to a point (3,)."""
+        """Return the median distance from the cameras to a point (3,)."""
         return float(np.median([np.linalg.norm(pose[:3, 3] - point) for _, pose in self.cameras.values()]))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "SparseModel":
-        """Transform cameras and points to another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        """Return a model with transformed cameras and points: x ↦ scale · rotation (3, 3) x + shift (3,)."""
         cameras = {n: (lens, moved_pose(pose, scale, rotation, shift)) for n, (lens, pose) in self.cameras.items()}
         return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
 
@@ -70,9 +70,10 @@ class SparseModel:
 def structure_from_motion(
     pictures: Sequence[Picture], detections: Detections, folder: Path, progress: Progress
 ) -> SparseModel:
-    """Estimate cameras from image features, one lens per image size.
+    """Estimate the cameras from image features. All photographs of one size share a lens.
 
-    Raises InputError if under half of the photographs succeed.
+    The result is saved in `folder`. If it is there already, it is read. Raises InputError if fewer than half of the
+    photographs get a camera.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     sparse = folder / "sparse"
@@ -102,17 +103,17 @@ def structure_from_motion(
 
 
 def placed_files(model: Any) -> set[str]:
-    """Return the file names of images that have a pose in a model; empty if `model` is None."""
+    """Return the file names of the images that have a pose in a model. If `model` is None, the set is empty."""
     return {model.images[k].name for k in model.reg_image_ids()} if model else set()
 
 
 def reconstruct(folder: Path, count: int, progress: Progress) -> Any:
-    """Reconstruct the cameras of `count` photographs in two ways. Returns the better model, or None if there is none.
+    """Reconstruct the cameras of `count` photographs in two ways. Returns the better model, or None if both fail.
 
     The better model is the one whose cameras explain more matches. Global mapping ("Global Structure-from-Motion
     Revisited", Pan et al. 2024) uses all matches from the start. Incremental mapping tolerates more wrong matches
-    (repeated patterns, moving shadows), but may mirror a camera that sees few points in one plane. Disconnected parts
-    of both models are removed.
+    (repeated patterns, moving shadows), but it may mirror a camera that sees few points in one plane. In both models,
+    images that `disconnected_images` returns lose their poses.
     """
     paths = database, _, output = folder / "database.db", folder / "grey", folder / "models"
     output.mkdir(exist_ok=True)
@@ -132,13 +133,13 @@ def reconstruct(folder: Path, count: int, progress: Progress) -> Any:
 
 
 def deregister(model: Any, images: Iterable[int]) -> None:
-    """Remove the poses of these images from a model."""
+    """Remove the poses of these images from a model. `model` is changed."""
     for k in list(images):
         model.deregister_frame(model.images[k].frame_id)
 
 
 def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
-    """Run global mapping. Returns models by number. `paths`: database, images, output."""
+    """Run COLMAP's global mapping. Returns a dict from numbers to models. `paths`: database, images, output."""
     options = pycolmap.GlobalPipelineOptions(random_seed=0)
     mapper = options.mapper
     for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
@@ -148,7 +149,10 @@ def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
 
 
 def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> dict[int, Any]:
-    """Run incremental mapping of `count` photographs. Returns models by number. `paths`: database, images, output."""
+    """Run COLMAP's incremental mapping. Returns a dict from numbers to models. `paths`: database, images, output.
+
+    `count`: number of photographs, for the progress bar.
+    """
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     options.mapper.random_seed = options.triangulation.random_seed = 0
     bar = iter(progress(range(count), "cameras", count))
@@ -161,7 +165,7 @@ def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> 
 
 
 class ImagePair(NamedTuple):
-    """Two images of a model, the number of their matches, and how many of these agree with the poses."""
+    """Two images of a model, their number of matches, and how many of these agree with the poses."""
 
     first: int
     second: int
@@ -170,7 +174,7 @@ class ImagePair(NamedTuple):
 
 
 def check_pairs(model: Any, database: Path) -> list[ImagePair]:
-    """For each pair of images with poses, count all matches and the matches that agree with the poses."""
+    """Count, for each pair of images with poses, all matches and those that agree with the poses."""
     images = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
     pairs = []
     for one, other, first, second in read_matches(database):
@@ -182,10 +186,11 @@ def check_pairs(model: Any, database: Path) -> list[ImagePair]:
 
 
 def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> list[int]:
-    """Find the images outside the largest connected part. A pair that explains most of its matches connects two images.
+    """Return the images whose poses must be removed: those outside the largest connected part.
 
-    The poses of such parts are random relative to the largest. Parts of one or two images are kept: the vote on masks
-    tolerates wrong poses of so few.
+    Two images are connected if their poses explain most of their matches. The poses of other parts are random relative
+    to the largest part. Images of a part with only one or two images are not returned. The vote on masks tolerates so
+    few wrong poses.
     """
     index = {k: number for number, k in enumerate(images)}
     firm = [p for p in pairs if p.matches >= PAIR_MATCHES and p.explained > PAIR_EXPLAINED * p.matches]
@@ -197,7 +202,10 @@ def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> li
 
 
 def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Sampson distances (n,) [px] of matches (n, 2) [px] between images `a` and `b`, from the poses in a model."""
+    """Return the Sampson distances (n,) [px] of n matches between the images `a` and `b`, by their poses in a model.
+
+    `first`, `second` (n, 2) [px]: the points of the matches in `a` and in `b`.
+    """
     cameras = model.cameras[a.camera_id], model.cameras[b.camera_id]
     rays = (camera.cam_from_img(pixels) for camera, pixels in zip(cameras, (first, second)))
     essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
@@ -205,19 +213,19 @@ def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.n
 
 
 def to_sparse_model(model: Any, pictures: Sequence[Picture], folder: Path) -> SparseModel:
-    """Convert a COLMAP model. Cameras and reprojection errors [px] then refer to the photographs at full size."""
+    """Convert a COLMAP model. The result's cameras and reprojection error [px] are for photographs at full size."""
     cameras, scales = model_cameras(model, pictures), [scale for _, _, scale in registered(model, pictures)]
     error = float(model.compute_mean_reprojection_error() * np.mean(scales))
     return SparseModel(cameras, model_points(model), error, failure_reasons(pictures, cameras, folder))
 
 
 def model_points(model: Any) -> np.ndarray:
-    """The points (N, 3) of a model."""
+    """Return the points (N, 3) of a model."""
     return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
 
 
 def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: Path) -> dict[str, str]:
-    """Explain why photographs that are not `placed` have no camera: reason by the photograph's name."""
+    """Say why photographs that are not `placed` have no camera. Returns a dict from their names to the reasons."""
     failed, reasons = [picture for picture in pictures if picture.name not in placed], {}
     detail = {p.name: sharpness(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
     for name, file in ((picture.name, grey_file(picture)) for picture in failed):
@@ -233,13 +241,13 @@ def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: 
 
 
 def sharpness(file: Path) -> float:
-    """Measure the sharpness of an image: the variance of its Laplacian, after a blur against noise."""
+    """Return the sharpness of an image. It is the variance of the Laplacian, after a blur against noise."""
     grey = read_image(file)[:, :, 0]
     return float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
 
 
 def advice(pictures: Sequence[Picture], folder: Path, count: int) -> str:
-    """Explain why only `count` photographs have a camera, and what to do."""
+    """Return a clause for the user: why only `count` photographs have a camera, and what to do."""
     with pycolmap.Database.open(folder / "database.db") as opened:
         features = np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()])
         matched = sum(len(geometry.inlier_matches) >= MIN_MATCHES for geometry in opened.read_two_view_geometries()[1])

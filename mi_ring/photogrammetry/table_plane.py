@@ -1,4 +1,4 @@
-"""The table under the object: its plane, its appearance, and the pixels of photographs that show it or do not."""
+"""The table under the object: its plane, its appearance, its albedo, and masks of pixels that show it or do not."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -43,18 +43,18 @@ class Plane(NamedTuple):
     offset: float
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Heights (...) of points (..., 3) above the plane."""
+        """Return the heights (...) of points (..., 3) above the plane."""
         return points @ self.normal - self.offset
 
     def axes(self) -> np.ndarray:
-        """Rows (3, 3): two directions in the plane, and the normal."""
+        """Return three unit vectors as rows (3, 3): two directions in the plane, and the normal."""
         return align_vectors(self.normal, [0, 0, 1])[:3, :3]
 
 
 def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half_size: float) -> Plane | None:
-    """Find the plane with most of the `points` (N, 3) around `center`, by RANSAC. None if there is none.
+    """Find the plane that contains most of the `points` (N, 3) around `center`, by RANSAC.
 
-    All `cameras`, positions (K, 3), must be above it.
+    Returns None if there is none. All `cameras`, positions (K, 3), must be above the plane.
     """
     near = points[np.linalg.norm(points - center, axis=1) < 2 * half_size]
     if len(near) < 50:
@@ -85,7 +85,10 @@ def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half
 
 
 class TexelGrid:
-    """A square of texels × texels in a plane, around the point below `center` (3,), with sides of 4 · `half_size`."""
+    """A square of texels × texels in a plane. Its middle is below `center` (3,).
+
+    The length of its sides is 4 · `half_size`.
+    """
 
     def __init__(self, plane: Plane, center: np.ndarray, half_size: float, texels: int = TEXELS) -> None:
         self.texels, self.normal, across = texels, plane.normal, plane.axes()[:2]
@@ -98,9 +101,9 @@ class TexelGrid:
 
     @property
     def to_world(self) -> np.ndarray:
-        """Transform (4, 4) from Mitsuba's rectangle (x, y from -1 to 1, normal z) to the world.
+        """Transform (4, 4) from Mitsuba's rectangle (x and y from -1 to 1, normal z) to the world.
 
-        Texel row 0 is at y = -1.
+        Row 0 of the texels is at y = -1.
         """
         middle = self.from_texel @ np.array([(self.texels - 1) / 2, (self.texels - 1) / 2, 1])
         across = self.from_texel[:, :2] * self.texels / 2
@@ -108,7 +111,10 @@ class TexelGrid:
         return np.column_stack([across, [*normal, 0], middle])
 
     def render(self, view: ReducedView, texels: np.ndarray) -> np.ndarray:
-        """Render values (texels², …) of the texels in a view: (H, W, …). Outside: NaN for float32, 0 for uint8."""
+        """Render values (texels², …) of the texels in a view. Returns (H, W, …).
+
+        Outside the square, the result is NaN for float32, and 0 for uint8.
+        """
         width, height = view.camera.size
         pixel_centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
         from_pixel = np.linalg.inv(view.camera.projection @ self.from_texel) @ pixel_centre
@@ -125,11 +131,11 @@ class TexelGrid:
 def estimate_albedo(
     views: Views, lights: Sequence[Light], hidden: Masks, grid: TexelGrid, flash: FlashCalibration
 ) -> np.ndarray | None:
-    """Estimate the table's diffuse albedo (texels, texels, 3): the median over views. None if no view shows the table.
+    """Estimate the table's diffuse albedo (texels, texels, 3). Returns None if no view shows the table.
 
-    `lights`: one per view. `hidden` (H, W) of each view: above 0 where something may hide the table. `flash`: gives
-    cone, room light and camera response. Texels that no view shows get the median of the others. Interreflection is
-    ignored.
+    It is the median over the views. `lights`: one per view. `hidden`: for each view, an array (H, W) above 0 where
+    something may hide the table. `flash`: gives the flash's cone, the room light and the camera's response. Texels that
+    no view shows get the median of the others. Interreflection is ignored.
     """
     found = np.full((len(views), grid.texels**2, 3), np.nan, np.float32)
     for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
@@ -149,9 +155,9 @@ def estimate_albedo(
 
 
 class TableAppearance:
-    """The table's appearance: one texture, multiplied by a smooth illumination in each view.
+    """The table's appearance: one texture for all views, times a smooth illumination for each view.
 
-    `hidden` (H, W) of each view: above 0 where something may hide the table; None: nowhere.
+    `hidden`: for each view, an array (H, W) above 0 where something may hide the table; None: nothing hides it.
     """
 
     def __init__(self, views: Views, grid: TexelGrid, progress: Progress, hidden: Masks | None = None) -> None:
@@ -173,9 +179,9 @@ class TableAppearance:
         self.texture = np.concatenate([nan_median(self.observe_all(part)) for part in progress(parts, "table")])
 
     def observe(self, number: int, texels: np.ndarray) -> np.ndarray:
-        """Log radiance (N, 3) of the texels with indices `texels` (N,) in view `number`; NaN where not shown.
+        """Return the log radiance (N, 3) of some texels in view `number`, minus the view's log illumination.
 
-        The illumination of the view is subtracted.
+        `texels` (N,): indices of the texels. The result is NaN where the view does not show the texel.
         """
         row, column, inside = self.views[number].project(self.grid.points[texels])
         if self.hidden:
@@ -184,11 +190,11 @@ class TableAppearance:
         return np.where(inside[:, None], own, np.float32(np.nan))
 
     def observe_all(self, texels: np.ndarray) -> np.ndarray:
-        """Log radiance (views, N, 3) of texels (N,) in all views, as `observe` gives it."""
+        """Return the log radiance (views, N, 3) of the texels (N,) in all views. See `observe`."""
         return np.stack(list(in_threads(partial(self.observe, texels=texels), range(len(self.views)))))
 
     def foreign_masks(self) -> list[np.ndarray]:
-        """For each view, mask (H, W) uint8 of pixels that differ from the table, because something stands there."""
+        """Return a mask (H, W) uint8 for each view: pixels that differ from the table. Something stands there."""
         result, everywhere = [], np.arange(len(self.texture))
         for number, view in enumerate(self.progress(self.views, "beside the table")):
             rest = np.abs(self.observe(number, everywhere) - self.texture).max(1)
@@ -199,7 +205,10 @@ class TableAppearance:
         return result
 
     def pattern_masks(self) -> list[np.ndarray]:
-        """For each view, mask (H, W) uint8 of pixels that certainly show the table, because they match its pattern."""
+        """Return a mask (H, W) uint8 for each view: pixels that certainly show the table.
+
+        They match the pattern of the table's texture.
+        """
         known = self.texture.mean(1)
         return [
             match_pattern(LOG_RADIANCE[view.rgb].mean(-1), self.grid.render(view, known))
@@ -207,7 +216,10 @@ class TableAppearance:
         ]
 
     def expected(self, view: ReducedView) -> np.ndarray:
-        """Predict log radiance (H, W, 3) of a view, or of a window of it, without the object; NaN if unknown."""
+        """Predict the log radiance (H, W, 3) of a view without the object. It is NaN where it is unknown.
+
+        `view` may be a window of one of the views.
+        """
         number = [other.name for other in self.views].index(view.name)
         return self.grid.render(view, self.texture + (self.basis @ self.lighting[number])[:, None])
 
@@ -215,10 +227,11 @@ class TableAppearance:
 def bare_table(
     views: Views, silhouettes: Masks, tables: Sequence[TableAppearance], progress: Progress
 ) -> list[np.ndarray] | None:
-    """For each view, mask (H, W) uint8 of pixels that show only the table. None if the object looks like the table.
+    """Return a mask (H, W) uint8 for each view: pixels that show only the table.
 
-    `tables`: appearances; each pixel is compared with the first that covers it. `silhouettes` (H, W): rough masks of
-    the object. Darker pixels count as shadows on the table, unless the object then looks like the table.
+    `silhouettes`: for each view, a rough mask (H, W) of the object. `tables`: appearances of the table. Each pixel is
+    compared with the first that covers it. Darker pixels count as table in shadow. If the object then looks like the
+    table, they do not count. If it still looks like the table, returns None.
     """
     differences = []
     for view in progress(views, "bare table"):
@@ -245,10 +258,10 @@ def bare_table(
 
 
 def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Differences (H, W, 3) of log radiances (H, W, 3): in the mean, in red/green and in blue/green; NaN if unknown.
+    """Return differences of log radiances (H, W, 3): in the mean, in red/green and in blue/green. NaN if unknown.
 
-    A pixel of `seen` is compared with the nearest value of 3 × 3 `expected` ones: the texture may be shifted by a
-    pixel.
+    A pixel of `seen` is compared with the nearest value in 3 × 3 pixels of `expected`, because the texture may be
+    shifted by a pixel.
     """
 
     def split(log: np.ndarray) -> np.ndarray:
@@ -262,16 +275,19 @@ def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 
 def nan_median(stack: np.ndarray) -> np.ndarray:
-    """Median over the first axis, ignoring NaN; the lower one of two; NaN if all are NaN.
+    """Return the median over the first axis without the NaN values. It is NaN if all values are NaN.
 
-    Much faster than `np.nanmedian`.
+    If two values are in the middle, it is the lower one. It is much faster than `np.nanmedian`.
     """
     middle = np.maximum(np.isfinite(stack).sum(0) - 1, 0) // 2
     return np.take_along_axis(np.sort(stack, 0), middle[None], 0)[0]
 
 
 def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Fit robust least-squares coefficients (6,) of a `basis` (N, 6) to the mean channel of a `difference` (N, 3)."""
+    """Return the coefficients (6,) of `basis` (N, 6) that fit the mean channel of `difference` (N, 3) best.
+
+    The fit is robust least squares.
+    """
     mean = difference.mean(1)
     known = np.isfinite(mean)
     if not known.any():
@@ -284,7 +300,7 @@ def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def match_pattern(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Mask (H, W) uint8 of pixels where log radiance `seen` (H, W) correlates with that of the `table`.
+    """Return a mask (H, W) uint8 of pixels where the log radiance `seen` (H, W) correlates with that of the table.
 
     `table` (H, W): log radiance without the object; NaN where it is unknown.
     """

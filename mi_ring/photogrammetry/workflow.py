@@ -1,4 +1,4 @@
-"""The stages from photographs to a capture. Each stage saves its results, so that an interrupted run continues."""
+"""The stages from photographs to a capture. Each stage saves its results, so that an interrupted run can continue."""
 
 import contextlib
 import json
@@ -36,7 +36,10 @@ FORMAT = 3  #: version of the saved results; increase it when they change
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
-    """Raise InputError if `folder` has results of other photographs or in another format."""
+    """Raise InputError if `folder` has results of other photographs or in another format.
+
+    Otherwise it creates the folder, and records the photographs there.
+    """
     with writing(f"{folder.parent}: DIR"):
         folder.mkdir(parents=True, exist_ok=True)
     record, first = folder / "photographs.json", folder / "sheet.json"  # without the latter there are no results
@@ -54,10 +57,10 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
 def make_upright(
     sparse: SparseModel, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
 ) -> tuple[SparseModel, Plane | None, bool]:
-    """Transform model and table to a frame with origin `center` (3,), z up, and cameras at about distance 1.
+    """Transform model and table to a frame with origin `center` (3,), z up, and cameras at a distance of about 1.
 
-    Returns (model, table, whether up is known). Up is the table's normal, else the mean of `ups` (3,), each in the axes
-    of its camera; it is unknown if these cancel out.
+    Returns (model, table, whether up is known). Up is the table's normal. Without a table, up is the mean of `ups`, a
+    dict by the photograph's name of directions (3,) in camera axes. If these cancel out, up is unknown.
     """
     scale = 1 / sparse.distance(center)
     up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in sparse.cameras.items()], 0)
@@ -68,7 +71,7 @@ def make_upright(
 
 
 class SheetObservations(NamedTuple):
-    """What the photographs show of the printed sheet, by the photograph's name."""
+    """What the photographs show of the printed sheet. Both dicts have names of photographs as keys."""
 
     detections: dict[str, SheetDetection]
     papers: dict[str, PaperSamples]
@@ -77,7 +80,11 @@ class SheetObservations(NamedTuple):
 def find_sheet(
     pictures: Sequence[Picture], square: float, folder: Path, progress: Progress
 ) -> SheetObservations | None:
-    """Find the sheet, whose squares are `square` mm wide; None if few photographs show it. Raises InputError."""
+    """Find the printed sheet in the photographs. `square`: side length of its squares [mm].
+
+    The result is saved in `folder`. If it is there already, it is read. Returns None if too few photographs show the
+    sheet. Raises InputError if a photograph cannot be read.
+    """
     record = folder / "sheet.json"
     if (saved := read_json(record)) is None:
 
@@ -109,9 +116,9 @@ def find_sheet(
 
 
 def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
-    """Read cameras that another tool has left beside the photographs. None if there are none.
+    """Read cameras that another tool has written beside the photographs. Returns None if there are none.
 
-    Raises InputError if the cameras are invalid, or if most photographs have none.
+    It prints the importer's notes. Raises InputError if the cameras are invalid, or if most photographs have no camera.
     """
     source = detect(pictures[0].path.parent)
     if source is None:
@@ -147,7 +154,7 @@ def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
 
 
 def require_parallax(sparse: SparseModel, folder: Path) -> None:
-    """Raise InputError if all photographs are from one side, so that depth is unknown."""
+    """Raise InputError if all photographs are from one side. Depth is then unknown."""
     forward = np.stack([pose[:3, 2] for _, pose in sparse.cameras.values()])
     widest = float(np.degrees(np.arccos(np.clip((forward @ forward.T).min(), -1, 1))))
     if widest < MIN_DEGREES:
@@ -158,10 +165,10 @@ def require_parallax(sparse: SparseModel, folder: Path) -> None:
 def find_cameras(
     pictures: Sequence[Picture], sheet: SheetObservations | None, turntable: bool, folder: Path, progress: Progress
 ) -> SparseModel:
-    """Find the cameras: those of another tool, otherwise by structure from motion, otherwise by the sheet.
+    """Find the cameras: those of another tool, else by structure from motion, else by the printed sheet.
 
-    With a turntable only by the sheet: structure from motion would track the room. Raises InputError if too few
-    photographs get a camera.
+    With `turntable`, only the sheet is used, because structure from motion would track the room. Raises InputError if
+    too few photographs get a camera.
     """
     if turntable:
         if sheet is None:
@@ -180,7 +187,10 @@ def find_cameras(
 
 
 def cameras_from_sheet(pictures: Sequence[Picture], sheet: SheetObservations) -> SparseModel:
-    """Find cameras by the sheet alone, in its frame [mm]. Raises InputError if fewer than half of all get one."""
+    """Find the cameras by the sheet alone, in its frame [mm].
+
+    Raises InputError if fewer than half of the photographs get a camera.
+    """
     cameras: dict[str, tuple[Lens, np.ndarray]] = {}
     errors: list[float] = []
     for size in dict.fromkeys(picture.size for picture in pictures):
@@ -201,7 +211,7 @@ def flash_from_sheet(
     pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
     sheet: SheetObservations,
 ) -> FlashCalibration | None:  # fmt: skip
-    """Calibrate the flash by the sheet, with the object as a sphere; None if no photograph shows the paper.
+    """Calibrate the flash by the sheet. A sphere stands for the object. Returns None if no photograph shows the paper.
 
     `offset` (3,): approximate position of the flash relative to the lens, as for `calibrate_flash`.
     """
@@ -223,10 +233,10 @@ def posed_pictures(
     pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
     flash: FlashCalibration | None,
 ) -> list[PosedPicture]:  # fmt: skip
-    """Combine each photograph that has a camera with its camera, light and masks.
+    """Return the photographs that have a camera, each with its camera, light and mask.
 
-    Without a calibrated `flash`, the flash is at `offset` (3,) relative to the lens [scene units], and its intensity
-    follows from `ASSUMED_ALBEDO`.
+    `flash`: the calibration. If it is None, the flash is at `offset` (3,) relative to the lens [scene units], and its
+    intensity follows from `ASSUMED_ALBEDO`.
     """
     offsets = turn_with_cameras(pictures, flash.offset if flash else offset)
     known = flash.intensities if flash else {}
