@@ -88,7 +88,7 @@ class VoxelGrid:
 
     @classmethod
     def seen_by(cls, views: Views) -> "VoxelGrid":
-        """Make a grid around the point at which the cameras look. It is so large that it fills the median photograph."""
+        """Make a grid around the point at which the cameras look. It is large enough to fill the median photograph."""
         cameras = [view.camera for view in views]
         origins = np.stack([camera.position for camera in cameras])
         center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), "cameras")
