@@ -1,4 +1,4 @@
-"""The paper's tables and figures: fits of datasets, and their results beside published numbers.
+"""The paper's tables and figures: they fit datasets, and show the results beside published numbers.
 
 May import: mitsuba, drjit, numpy, scipy, torch, matplotlib; foreign, images, collection, fitting, synthesis,
 importers, output, metrics, capture, rendering, objects, scene, geometry, system.

@@ -1,4 +1,4 @@
-"""BRDF slices: values for light and camera in the same direction, evaluated by Mitsuba."""
+"""BRDF slices: values of a BRDF for light and camera in the same direction. Mitsuba evaluates them."""
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +11,10 @@ ANGLES = np.radians(np.arange(0, 76, 5))  #: between the normal and the common d
 
 
 def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
-    """A `cooktorrance` of V materials, as a texture of V pixels in a row. `material`: arrays (V, 3) or (V,) by name."""
+    """Make one `cooktorrance` BSDF of V materials. Its parameters are textures with V pixels in a row.
+
+    `material`: a dict from names of parameters to arrays (V, 3) or (V,).
+    """
     texture = {"type": "bitmap", "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
     return mi.load_dict({"type": "cooktorrance", **{
         name: texture | {"bitmap": mi.Bitmap(np.ascontiguousarray(value.reshape(1, len(value), -1), np.float32))}
@@ -20,7 +23,7 @@ def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
 
 
 def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
-    """BRDFs (count, angles, 3) [1/sr] at the `ANGLES` for a BSDF of `count` materials, as `bsdf_of` makes it."""
+    """Return the BRDFs (count, angles, 3) [1/sr] at the `ANGLES`. `bsdf`: one of `count` materials, from `bsdf_of`."""
     angle, k = np.tile(ANGLES, count), np.repeat(np.arange(count), len(ANGLES))
     si = dr.zeros(mi.SurfaceInteraction3f, len(angle))
     si.uv = mi.Point2f(mi.Float((k + 0.5) / count), 0.5)
@@ -31,7 +34,10 @@ def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
 
 
 def is_second_material(config: SynthesizeConfig, bounds: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which points (P, 3) near the true object have the second material: (P,) bool. `bounds` (2, 3): of the object."""
+    """Return which points (P, 3) near the true object have its second material: (P,) bool.
+
+    `bounds` (2, 3): lowest and highest corner of the object.
+    """
     edge = 1e-4 * (bounds[1] - bounds[0])  # outside the bounds the pattern would repeat
     inside = np.clip(points, bounds[0] + edge, bounds[1] - edge)
     pattern = pattern_of(config.pattern, np.concatenate([bounds, inside]), config.bands, "xyz".index(config.up), "")

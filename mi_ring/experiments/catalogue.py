@@ -1,4 +1,4 @@
-"""The experiments: their runs, columns and figures."""
+"""The experiments: which fits they run, and the columns and figures of their results."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -33,12 +33,16 @@ ListRuns = Callable[[ExperimentOptions], list[Run]]
 
 
 def each_dataset(**fields: Any) -> ListRuns:
-    """A run for each dataset. `fields`: of `Run`."""
+    """Return a function that lists one run for each dataset. `fields`: fields of these `Run`."""
     return lambda options: [Run(d.name, d, {"capture": d.name}, **fields) for d in datasets(options)]
 
 
 def each_setting(label: str, settings: dict[Any, dict[str, Any]], quick: Sequence[Any] = ()) -> ListRuns:
-    """A run for each dataset and each value of a label. `settings`: of `Config`; `quick`: values for --quick."""
+    """Return a function that lists one run for each dataset and each value of a label.
+
+    `settings`: a dict from values of the label to fields of `Config`. `quick`: the values that --quick uses; empty:
+    all.
+    """
 
     def list_runs(options: ExperimentOptions) -> list[Run]:
         values = [*settings] if not (options.quick and quick) else quick
@@ -49,7 +53,10 @@ def each_setting(label: str, settings: dict[Any, dict[str, Any]], quick: Sequenc
 
 
 def table2(options: ExperimentOptions) -> list[Run]:
-    """List the runs: each object of DiLiGenT-MV that is in the paper or in DATA. Objects that are not in DATA fail."""
+    """List the runs: one for each object of DiLiGenT-MV that is in the paper or in DATA.
+
+    The run of an object that is not in DATA will fail. Raises InputError if DATA is not the folder of DiLiGenT-MV.
+    """
     require_no_materials(options)
     if len(options.data) != 1:
         raise InputError("DATA: table2 needs one folder, that of DiLiGenT-MV with mvpmsData/bearPNG and others; get it "
@@ -68,7 +75,7 @@ def table2(options: ExperimentOptions) -> list[Run]:
 
 
 def table3(options: ExperimentOptions) -> list[Run]:
-    """List the runs: each dataset with exact cameras, with wrong cameras, and with wrong cameras that are refined."""
+    """List three runs for each dataset: exact cameras, wrong cameras, and wrong cameras that the fit refines."""
     runs = []
     for exact in datasets(options):
         for seed in options.seeds:
@@ -84,7 +91,7 @@ def table3(options: ExperimentOptions) -> list[Run]:
 
 
 def specularity(options: ExperimentOptions) -> list[Run]:
-    """List the runs: one mesh with each of the materials."""
+    """List one run for each material. All use the same mesh."""
     mesh = one_mesh(options)
     materials = options.materials or (GLOSSY[::2] if options.quick else GLOSSY)
     names = [short_name(material) for material in materials]
@@ -97,7 +104,7 @@ def specularity(options: ExperimentOptions) -> list[Run]:
 
 
 def stripes(options: ExperimentOptions) -> list[Run]:
-    """List the runs: one mesh with stripes of two materials."""
+    """List one run: a mesh with stripes of two materials. Raises InputError if two materials are not given."""
     mesh, materials = one_mesh(options), options.materials or STRIPED
     if len(materials) != 2:
         raise InputError(f"--materials: are {len(materials)}, stripes need two")
@@ -109,7 +116,7 @@ def stripes(options: ExperimentOptions) -> list[Run]:
 
 
 def views(options: ExperimentOptions) -> list[Run]:
-    """List the runs: each dataset with several numbers of photographs, up to all."""
+    """List several runs for each dataset, with increasing numbers of photographs, up to all of them."""
     runs = []
     for source in datasets(options):
         fewer = {count for count in (VIEWS[:1] if options.quick else VIEWS) if count < source.photographs}
@@ -120,7 +127,7 @@ def views(options: ExperimentOptions) -> list[Run]:
 
 
 def swap(options: ExperimentOptions) -> list[Run]:
-    """List the runs: two or more datasets, each fitted from a sphere."""
+    """List one run for each dataset. Each fit starts from a sphere. Raises InputError for fewer than two datasets."""
     if not options.data:
         require_no_materials(options)
     found = datasets(options)
@@ -132,7 +139,7 @@ def swap(options: ExperimentOptions) -> list[Run]:
 
 
 def single(options: ExperimentOptions) -> list[Run]:
-    """List the runs: each object of DiLiGenT, with photographs of one camera."""
+    """List one run for each object of DiLiGenT. All photographs of an object are from one camera."""
     require_no_materials(options)
     if not options.data:
         raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/how-to/paper.md "

@@ -30,19 +30,22 @@ WANTED = "the folder of a capture with scene.xml and truth/mesh.ply, or its scen
 
 @dataclass(frozen=True)
 class Dataset:
-    """A capture with ground truth. `prepare` of the subclasses writes its files."""
+    """A capture with ground truth. `prepare` writes its files, if a subclass makes them."""
 
     name: str
     scene: Path  #: scene file
     truth: Path  #: folder with mesh.ply and, perhaps, scene.xml of novel views
 
     def prepare(self) -> None:
-        """Write files that are missing or outdated, one process at a time. Raises InputError if that fails."""
+        """Write the files that are missing or outdated. Only one process does this at a time.
+
+        In this base class, the files must exist already. Raises InputError if a file is missing or cannot be written.
+        """
         require_file(self.scene, WANTED)
 
     @property
     def truth_files(self) -> list[Path]:
-        """The files that a fit is compared with. Some may be missing."""
+        """Files with the ground truth, with which a fit is compared. Some may be missing."""
         return [self.truth / "mesh.ply", self.truth / "scene.xml"]
 
     @property
@@ -53,7 +56,10 @@ class Dataset:
 
 
 def given(path: Path) -> Dataset:
-    """The user's capture, from its folder or scene file. Raises InputError if scene file or truth are missing."""
+    """Return the dataset of a user's capture. `path`: its folder or its scene file.
+
+    Raises InputError if the scene file or the true mesh is missing.
+    """
     scene = path / "scene.xml" if path.is_dir() else path
     require_file(scene, WANTED)
     folders = [scene.with_suffix("") / "truth", scene.parent / "truth"]
@@ -65,7 +71,10 @@ def given(path: Path) -> Dataset:
 
 
 def default_dataset(captures: Path) -> Dataset:
-    """The default dataset: pot2 in a checkout of the repository, otherwise the pot of `mi-ring example`."""
+    """Return the default dataset: pot2 in a checkout of the repository, otherwise the pot of `mi-ring example`.
+
+    `captures`: folder in which that pot will be written.
+    """
     return given(POT2) if POT2.is_file() else ExamplePot.of(captures / "example")
 
 
@@ -74,11 +83,11 @@ Cached = TypeVar("Cached", bound="CachedDataset")
 
 @dataclass(frozen=True)
 class CachedDataset(Dataset):
-    """A dataset in a folder of its own. It is written again if its sources have changed."""
+    """A dataset that is written to a folder of its own. If its sources change, it is written again."""
 
     @classmethod
     def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
-        """Make the dataset in a folder. `fields`: values of the fields that the subclass adds."""
+        """Return the dataset in `folder`. Nothing is written yet. `fields`: the fields that the subclass adds."""
         return cls(folder.name, folder / "scene.xml", folder / "truth", *fields)
 
     def prepare(self) -> None:
@@ -92,17 +101,17 @@ class CachedDataset(Dataset):
                     shutil.rmtree(folder, ignore_errors=True)  # outdated or incomplete
 
     def origin(self) -> dict[str, Any]:
-        """The dataset's sources and their modification times, as JSON values."""
+        """Return the sources of the dataset and their modification times, as JSON values."""
         raise NotImplementedError
 
     def write(self, folder: Path) -> None:
-        """Write the dataset into an empty folder, which is then renamed to `self.scene.parent`."""
+        """Write the dataset to an empty folder. Afterwards, `prepare` renames this folder to `self.scene.parent`."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class ExamplePot(CachedDataset):
-    """The small capture of `mi-ring example`."""
+    """The small capture that `mi-ring example` makes."""
 
     photographs = VIEWS
 
@@ -115,7 +124,7 @@ class ExamplePot(CachedDataset):
 
 @dataclass(frozen=True)
 class Synthetic(Dataset):
-    """A capture of `mi-ring synthesize`."""
+    """A capture that `mi-ring synthesize` makes by path tracing."""
 
     config: SynthesizeConfig
     of_pot: bool  #: whether it shows the example's pot, whose mesh is then written too
@@ -143,7 +152,7 @@ class Synthetic(Dataset):
 
 @dataclass(frozen=True)
 class Derived(CachedDataset):
-    """The photographs and the truth of another dataset, with a scene file of its own."""
+    """A dataset that uses the photographs and the ground truth of another one. It has a scene file of its own."""
 
     source: Dataset
 
@@ -166,13 +175,16 @@ class Derived(CachedDataset):
         write_file(folder / "scene.xml", self.changed(root))
 
     def changed(self, root: ElementTree.Element) -> bytes:
-        """The content of its scene file. `root`: the source's XML with adjusted file names; it may be changed."""
+        """Return the content of the dataset's scene file.
+
+        `root`: XML of the source's scene file, in which file names are already adjusted. It may be changed.
+        """
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Subset(Derived):
-    """Some photographs of a capture, evenly spaced from the first to the last."""
+    """Some photographs of a capture, evenly spaced. The first and the last are among them."""
 
     count: int
 
@@ -187,7 +199,7 @@ class Subset(Derived):
 
 @dataclass(frozen=True)
 class PerturbedCameras(Derived):
-    """A capture with wrong cameras (see `miscalibrated`), which are not marked as calibrated."""
+    """A capture with wrong cameras; see `miscalibrated`. It does not say that the cameras are exact."""
 
     degrees: float  #: standard deviation of rotations [deg] and of positions [% of the distance]
     seed: int
@@ -204,7 +216,7 @@ class PerturbedCameras(Derived):
 
 @dataclass(frozen=True)
 class DiligentObject(CachedDataset):
-    """An object of DiLiGenT-MV, converted."""
+    """An object of DiLiGenT-MV. It is converted to a scene file."""
 
     source: Path  #: its folder in DiLiGenT-MV
     fill_holes: bool = False  #: in its masks

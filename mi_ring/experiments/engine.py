@@ -1,4 +1,4 @@
-"""Runs an experiment: prepares datasets, fits, measures, and writes table and figure after each run."""
+"""Runs an experiment: prepares datasets, fits, and measures. Writes table and figure after each run."""
 
 import io
 import json
@@ -33,10 +33,11 @@ RETRIES = 1  #: of a fit that is killed without making progress
 def run_experiment(
     experiment: Experiment, options: ExperimentOptions, out: Path, only: Collection[str] = (), command_line: str = ""
 ) -> int:
-    """Perform all runs, or the runs named in `only`. Returns the number of failed runs; the others continue.
+    """Perform all runs, or only those named in `only`. Returns the number of failed runs.
 
-    Results are in out/runs/. table.csv, table.md and figure.png are written after each run. Results of unchanged files
-    and settings are kept. Raises InputError before the first run if options are wrong.
+    If a run fails, the others go on. The results of the runs are in `out`/runs/. After each run, table.csv, table.md
+    and figure.png are written. If files and settings of a run have not changed, its results are kept. Raises InputError
+    before the first run if options are wrong.
     """
     runs = experiment.runs(options)
     if unknown := set(only) - {run.name for run in runs}:
@@ -57,7 +58,10 @@ def run_experiment(
 
 
 def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True) -> Outcome:
-    """Fit and measure a run. An error gives a failed outcome. If not `wanted`, only an existing fit is measured."""
+    """Fit and measure a run. If an error occurs, returns an outcome that says why the run failed.
+
+    `wanted`: False: do not fit, only measure an existing fit.
+    """
     try:
         if wanted:
             run.dataset.prepare()
@@ -91,7 +95,10 @@ def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True
 
 
 def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Measure a finished fit: its rows, read from `NUMBERS` if the files have not changed since."""
+    """Return the rows of a finished fit, and save them in its folder.
+
+    If the files have not changed since the last time, the saved rows are read instead.
+    """
     measure = run.measure or evaluated
     of = {"measure": measure.__name__, "spp": options.spp, "written": modified(folder / "ring.pt"),
           "compared": [[str(file.resolve()), modified(file)] for file in run.dataset.truth_files],
@@ -104,7 +111,7 @@ def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]
 
 
 def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptions) -> Record:
-    """Fit in this process and write the errors of normals and depth at `POINTS` times during the fit."""
+    """Fit in this process. Measures the errors of normals and depth `POINTS` times during the fit, and writes them."""
     rows: list[Row] = []
 
     def measure(it: Iteration) -> None:
@@ -125,7 +132,10 @@ def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptio
 
 
 def write_table_and_figure(experiment: Experiment, outcomes: list[Outcome], out: Path, command_line: str) -> None:
-    """Write table.csv, table.md and figure.png. Without a finished run, or if drawing fails, there is no figure."""
+    """Write table.csv, table.md and figure.png to the folder `out`.
+
+    If no run is finished, or if drawing fails, figure.png is removed.
+    """
     rows = table_of(experiment, outcomes)
     names = headings(experiment, outcomes, rows)
     out.mkdir(parents=True, exist_ok=True)

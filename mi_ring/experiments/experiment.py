@@ -1,4 +1,4 @@
-"""An experiment: a list of runs, each a fit of a dataset, and the table and figure of their results."""
+"""An experiment: a list of runs, each of which fits a dataset, and the table and figure of their results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -51,7 +51,7 @@ class ExperimentOptions:
 
 @dataclass(frozen=True)
 class Run:
-    """One fit of an experiment: its dataset, settings and measures."""
+    """One fit of an experiment: its dataset, its settings, and how it is measured."""
 
     name: str  #: of the results folder
     dataset: Dataset
@@ -63,15 +63,15 @@ class Run:
     watched: bool = False  #: measure the surface during the fit, too; such a fit cannot be resumed
 
     def config(self, options: ExperimentOptions) -> Config:
-        """The settings of the fit. Raises InputError for values that `Config` rejects."""
+        """Return the settings of the fit. Raises InputError for values that `Config` rejects."""
         return Config.preset(options.preset, **self.settings(options))
 
     def settings(self, options: ExperimentOptions) -> dict[str, Any]:
-        """All settings that differ from the preset."""
+        """Return all settings that differ from the preset: a dict from fields of `Config` to values."""
         return {**(QUICK if options.quick else {}), **self.changes}
 
     def fit_options(self, options: ExperimentOptions) -> tuple[str, ...]:
-        """The settings as options of `mi-ring fit`."""
+        """Return the settings as command-line options of `mi-ring fit`."""
         words = ["--preset", options.preset, "--variant", options.variant]
         for name, value in self.settings(options).items():
             words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
@@ -111,7 +111,10 @@ class Experiment:
     one_seed: bool = False  #: whether only one seed is allowed, because its rows have no mean
 
     def runs(self, options: ExperimentOptions) -> list[Run]:
-        """All runs, one for each seed. Raises InputError if DATA or --materials are wrong, or for equal names."""
+        """Return all runs, one for each seed.
+
+        Raises InputError if DATA or --materials are wrong, or if two runs would have the same name.
+        """
         runs = seeded(self.list_runs(options), options.seeds)
         names = [run.name for run in runs]
         if twice := next((name for name in names if names.count(name) > 1), None):
@@ -123,7 +126,10 @@ class Experiment:
 
 
 def seeded(runs: Sequence[Run], seeds: Sequence[int]) -> list[Run]:
-    """Repeat each run with each seed; a run that sets its own seed once. Names do not depend on the other seeds."""
+    """Repeat each run with each seed. A run that sets its own seed is not repeated.
+
+    The name of a run does not depend on the other seeds.
+    """
     result = []
     for run in runs:
         for seed in [None] if "seed" in run.changes else seeds:

@@ -1,4 +1,4 @@
-"""Measures of fits: functions (run, results folder, options) ↦ rows of the table."""
+"""Measures of finished fits: functions of (run, results folder, options) that return rows of the table."""
 
 import json
 from pathlib import Path
@@ -33,7 +33,10 @@ SLICE_LEVEL = 3  #: subdivisions: at these vertices materials are compared
 
 
 def evaluated(run: Run, folder: Path, options: ExperimentOptions, align: str = "", seen: bool = False) -> list[Row]:
-    """The numbers of `mi-ring evaluate`, but crossing and inverted triangles in % of all; and the fit time [s]."""
+    """Return one row: the numbers of `mi-ring evaluate`, and the duration of the fit [s].
+
+    Crossing and inverted triangles are in % of all triangles. `align`, `seen`: as for `evaluate`.
+    """
     truth, novel = run.dataset.truth / "mesh.ply", run.dataset.truth / "scene.xml"
     numbers = evaluate(folder, truth, novel if novel.is_file() else None, options.spp, seen, align)
     row = {key: value for key, value in numbers.items() if not isinstance(value, list)}
@@ -45,7 +48,7 @@ def evaluated(run: Run, folder: Path, options: ExperimentOptions, align: str = "
 
 
 def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Share of triangles (F, 3) that cross others [%]: exact if libigl is installed."""
+    """Return the share of the triangles (F, 3) that cross others [%]. It is exact if libigl is installed."""
     count = exactly_crossing if installed("igl") else crossing_triangles
     return 100 * float(np.mean(count(vertices, faces)))
 
@@ -53,7 +56,7 @@ def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
 def surface_errors(
     run: Run, capture: Capture, ring: FittedObject, s: Tensor, faces: np.ndarray
 ) -> tuple[np.ndarray, Row]:
-    """The surface (V, 3) of an object at domain points `s` (V, 3), and its errors."""
+    """Return the surface of an object at domain points `s` (V, 3), as vertices (V, 3), and a row with its errors."""
     mesh, truth = load_true_mesh(run.dataset.truth / "mesh.ply")
     with torch.no_grad():
         vertices = ring.surface(s.to(ring.center.device)).cpu().numpy()
@@ -61,28 +64,34 @@ def surface_errors(
 
 
 def in_millimetres(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Numbers of `evaluated`, only where photographs show the surface; depth and Chamfer distance also in mm."""
+    """Return one row: the numbers of `evaluated`, but only where photographs show the surface.
+
+    Depth and Chamfer distance are also given in mm.
+    """
     percent = load_true_mesh(run.dataset.truth / "mesh.ply")[0].scale / 100
     (row,) = evaluated(run, folder, options, seen=True)
     return [row | {"depth_mm": row["depth_mean"] * percent, "chamfer_mm": row["chamfer"] * percent}]
 
 
 def aligned(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Numbers of `evaluated` after rigid alignment; `turned`: root mean square of the cameras' rotation errors [°]."""
+    """Return one row: the numbers of `evaluated` after rigid alignment, and `turned`.
+
+    `turned` is the root mean square of the cameras' rotation errors [°].
+    """
     (row,) = evaluated(run, folder, options, align="rigid")
     exact = run.dataset.source if isinstance(run.dataset, PerturbedCameras) else run.dataset
     return [row | {"turned": rotation_error(exact.scene, folder / "scene.xml")}]
 
 
 def rotation_error(a: Path, b: Path) -> float:
-    """Root mean square angle [°] between the cameras of two scenes, after removing a common rotation."""
+    """Return the root mean square angle [°] between the cameras of two scenes, after removing a common rotation."""
     first, second = ([s.camera.to_world[:3, :3] for s in load_capture(x, images=False).shots] for x in (a, b))
     between = Rotation.from_matrix([x @ y.T for x, y in zip(first, second, strict=True)])
     return float(np.degrees(np.sqrt(np.mean((between * between.mean().inv()).magnitude() ** 2))))
 
 
 def by_level(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """A row for each of the `LEVELS` at which one fit is sampled."""
+    """Sample one fit at each of the `LEVELS`. Returns a row of numbers for each level."""
     ring, capture = load_fit(folder), load_capture(run.dataset.scene, images=False)
     rows = []
     for level in LEVELS:
@@ -94,12 +103,15 @@ def by_level(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
 
 
 def course(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """The rows that `fit_and_watch` wrote."""
+    """Return the rows that `fit_and_watch` has written during the fit."""
     return json.loads((folder / COURSE).read_text())
 
 
 def single_view_normals(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Errors of the normals that the camera of a `SingleView` sees; 90° where it misses the surface."""
+    """Return one row: errors of the normals that the camera of a `SingleView` sees.
+
+    Where the camera misses the fitted surface, the error is 90°.
+    """
     angles, missed = normal_errors(run, folder)
     known = np.isfinite(angles)
     return [{
@@ -109,7 +121,10 @@ def single_view_normals(run: Run, folder: Path, options: ExperimentOptions) -> l
 
 
 def normal_errors(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Normal errors (H, W) [°] of a `SingleView`, NaN without known truth; pixels (H, W) bool that miss the surface."""
+    """Return two arrays (H, W) for a `SingleView`: errors of normals [°], and whether the pixel misses the surface.
+
+    The error is NaN where the true normal is unknown.
+    """
     assert isinstance(run.dataset, SingleView)
     data = run.dataset.read()
     shape = data["mask"].shape
@@ -122,7 +137,10 @@ def normal_errors(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_slices(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Numbers of `evaluated` and of `compare_slices`. For one material, writes slices.npz for the figure."""
+    """Return one row: the numbers of `evaluated` and of `compare_slices`.
+
+    If the object has one material, slices.npz is written to `folder` for the figure.
+    """
     (row,) = evaluated(run, folder, options)
     found, truth, other = slices_of(run, folder)
     if other is None:
@@ -131,11 +149,11 @@ def with_slices(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]
 
 
 def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | None) -> Row:
-    """Errors of BRDF slices (V, angles, 3) at points of the surface.
+    """Return a row with the errors of BRDF slices (V, angles, 3) at V points of the surface.
 
     `slice_error`: abs(found − truth) / max(truth, `BLACK`), mean over angles and channels, median over points [%].
-    `right_material`: share of points [%] whose slice is nearer to the true slice than to that of the `other` material.
-    Distances are those of logarithms.
+    `right_material`: share of the points [%] whose slice is nearer to the true slice than to that of the `other`
+    material. Distances are between logarithms of slices.
     """
     error = (np.abs(found - truth) / np.maximum(truth, BLACK)).mean((1, 2))
     row = {"slice_error": 100 * float(np.median(error))}
@@ -147,7 +165,10 @@ def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | Non
 
 
 def slices_of(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """BRDF slices (V, angles, 3) [1/sr] at points of the surface: fitted, true, and of the other material, if any."""
+    """Return BRDF slices (V, angles, 3) [1/sr] at V points of the surface: (fitted, true, of the other material).
+
+    If the object has one material, the last is None.
+    """
     assert isinstance(run.dataset, Synthetic)
     config = run.dataset.config
     ring = load_fit(folder)

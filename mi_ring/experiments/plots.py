@@ -28,12 +28,12 @@ Plot = Callable[[list[Outcome]], Figure]
 
 
 def title_of(outcome: Outcome, but: str = "") -> str:
-    """Write the labels of a run as text, without the label `but`. Numbers follow the names of their labels."""
+    """Return the labels of a run as text, without the label `but`. A number follows the name of its label."""
     return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items() if k != but)
 
 
 def of_finished(plot: Plot) -> Plot:
-    """A decorator: the plot gets only finished runs, and a line below it names the failed runs."""
+    """Decorate a plot. It then gets only the finished runs. A line below the figure names the failed runs."""
 
     @functools.wraps(plot)
     def annotated(outcomes: list[Outcome]) -> Figure:
@@ -46,7 +46,10 @@ def of_finished(plot: Plot) -> Plot:
 
 
 def bars(*columns: tuple[str, str]) -> Plot:
-    """Bar charts of columns (name, heading), with a bar for each run. A word replaces a missing number."""
+    """Return a plot with a bar chart for each column (name, heading).
+
+    Each run has a bar. If its number is missing, a word is in its place.
+    """
 
     def plot(outcomes: list[Outcome]) -> Figure:
         figure = Figure(figsize=(4.5 * len(columns), 1.2 + 0.35 * len(outcomes)), layout="constrained")
@@ -65,7 +68,7 @@ def bars(*columns: tuple[str, str]) -> Plot:
 
 
 def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) -> Plot:
-    """Curves of column y over column x, each (name, heading). Runs that differ only in x share a curve."""
+    """Return a plot of column y over column x. Each is (name, heading). Runs that differ only in x share a curve."""
 
     @of_finished
     def plot(outcomes: list[Outcome]) -> Figure:
@@ -87,7 +90,10 @@ def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) ->
 
 @of_finished
 def slices(outcomes: list[Outcome]) -> Figure:
-    """Draw for each run the true and the fitted median BRDF over the angle of light and camera from the normal."""
+    """Draw the true and the fitted median BRDF for each run.
+
+    The x axis is the angle between the normal and the common direction of light and camera.
+    """
     figure = Figure(figsize=(4 * len(outcomes), 3.6), layout="constrained")
     for axes, outcome in zip(np.ravel(figure.subplots(1, len(outcomes), squeeze=False)), outcomes):
         with np.load(outcome.folder / "slices.npz") as arrays:
@@ -136,7 +142,10 @@ def swapped(outcomes: list[Outcome]) -> Figure:
 
 
 def grid(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[str]) -> Figure:
-    """Draw a table of pictures (H, W, 3) and error maps (H, W) [deg]. `rows`: title, pictures; `heads`: of columns."""
+    """Draw a table of pictures (H, W, 3) and error maps (H, W) [deg].
+
+    `rows`: (title, pictures) of each row. `heads`: titles of the columns.
+    """
     figure = Figure(figsize=(2.6 * len(heads), 2.7 * len(rows)), layout="constrained")
     for line, (title, images) in zip(figure.subplots(len(rows), len(heads), squeeze=False), rows):
         for axes, image in zip(line, images):
@@ -149,7 +158,10 @@ def grid(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[str]) -> 
 
 
 def predicted(outcome: Outcome, ring: FittedObject) -> tuple[np.ndarray, int]:
-    """Prediction of the first photograph, sRGB (H, W, 3), and the factor by which it is smaller than the photograph."""
+    """Render the first photograph of a run. Returns (sRGB picture (H, W, 3), factor).
+
+    The photograph is `factor` times as large as the picture.
+    """
     capture = load_capture(outcome.folder / "scene.xml", images=False)
     scale = -(-capture.shots[0].size[0] // WIDTH)
     surface = Surface(capture.scene, capture.shape, ring)

@@ -1,4 +1,4 @@
-"""Published numbers, which tables show beside ours."""
+"""Published numbers. Our tables show them beside our own numbers."""
 
 PAPER = "paper"  #: Cheng et al., One Ring to Rule Them All, ICCV 2021
 

@@ -21,7 +21,12 @@ SIZES: dict[str, dict[str, Any]] = {
 
 
 def datasets(options: ExperimentOptions) -> list[Dataset]:
-    """The captures and meshes of DATA; without DATA, the default dataset. Meshes are path traced, materials in turn."""
+    """Return a dataset for each capture and each mesh in DATA. Without DATA, return the default dataset.
+
+    Nothing is rendered yet: `prepare` of the dataset path traces a mesh. The first mesh gets the first of --materials,
+    the second mesh the second, and so on. If there are fewer materials than meshes, they start again from the first.
+    Raises InputError if DATA or --materials are wrong.
+    """
     meshes = [path for path in options.data if path.suffix.lower() in MESHES]
     if options.materials and not meshes:
         raise InputError("--materials: apply to meshes only; give meshes as DATA")
@@ -44,7 +49,10 @@ def datasets(options: ExperimentOptions) -> list[Dataset]:
 def path_traced(
     options: ExperimentOptions, mesh: Path | None, material: str | None, name: str = "", **more: Any
 ) -> Synthetic:
-    """A mesh, or the example's pot, photographed as in the paper. `more`: other options of `mi-ring synthesize`."""
+    """Return a dataset of path-traced photographs of a mesh, as in the paper. Nothing is rendered yet.
+
+    `mesh`: None: the pot of `mi-ring example`. `more`: other options of `mi-ring synthesize`.
+    """
     settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[options.size], **more}
     config = SynthesizeConfig(Path(), Path(), material, **settings)
     name = name or (mesh.stem if mesh else "pot")
@@ -55,13 +63,16 @@ def path_traced(
 
 
 def require_no_materials(options: ExperimentOptions) -> None:
-    """Raise InputError if --materials is given. For experiments that do not use it."""
+    """Raise InputError if --materials is given. It is for experiments that do not use materials."""
     if options.materials:
         raise InputError("--materials: apply to meshes, which this experiment does not use; leave them out")
 
 
 def one_mesh(options: ExperimentOptions) -> Path | None:
-    """The only mesh of DATA, or None. Raises InputError for other DATA and for textured materials."""
+    """Return the mesh in DATA, or None if DATA is empty.
+
+    Raises InputError if DATA is anything else than one mesh, or if a material is textured.
+    """
     for material in options.materials:
         load_material(material, "--materials", coloured=True)
         text = Path(material).read_text(errors="replace") if material.lower().endswith(".xml") else material
@@ -74,7 +85,7 @@ def one_mesh(options: ExperimentOptions) -> Path | None:
 
 
 def short_name(material: str) -> str:
-    """A short name of a material for file names: its plugin or file, and its roughness."""
+    """Return a short name of a material for file names. It has the plugin or the file, and the roughness."""
     if ".npz:" in material:
         return material.rpartition(":")[2]
     words = material.split()

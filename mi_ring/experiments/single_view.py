@@ -1,4 +1,4 @@
-"""DiLiGenT's photographs of one camera as a dataset."""
+"""A dataset of DiLiGenT's photographs, all of which are from one camera."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,14 +27,15 @@ MANUAL = "docs/how-to/paper.md"  #: describes these arrays
 class SingleView(CachedDataset):
     """DiLiGenT's photographs of one real camera under 96 lights, in an .npz file.
 
-    Its arrays: `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x right, y up, z
-    to the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; same axes, 0 where unknown) and `K` (3, 3).
+    The file has these arrays: `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x
+    right, y up, z to the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; same axes, 0 where unknown) and `K`
+    (3, 3).
     """
 
     file: Path
 
     def read(self) -> dict[str, np.ndarray]:
-        """The arrays. Raises InputError if one is missing or of another shape."""
+        """Read the arrays. Returns a dict by name. Raises InputError if an array is missing or has another shape."""
         require_file(self.file, "an .npz of DiLiGenT's photographs from one side")
         arrays = load_npz(self.file)
         for name, dimensions in DIMENSIONS.items():
@@ -59,7 +60,10 @@ class SingleView(CachedDataset):
         return {"file": str(self.file.resolve()), "written": modified(self.file)}
 
     def write(self, folder: Path) -> None:
-        """A scene of 16-bit photographs. The camera is at the origin, looks along z, and is 1.5 m from the object."""
+        """Write a scene of 16-bit photographs to `folder`.
+
+        The camera is at the origin, looks along z, and is 1.5 m from the object.
+        """
         data = self.read()
         mask, K = data["mask"] > 0, data["K"]
         height, width = mask.shape

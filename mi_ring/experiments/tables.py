@@ -1,4 +1,4 @@
-"""Tables of our results and published ones, as CSV and Markdown."""
+"""Tables of our results and of published ones, as CSV and Markdown."""
 
 import csv
 import datetime
@@ -13,9 +13,9 @@ OURS = "ours"  #: value of the column `by`
 
 
 def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Collect the rows of the table: ours, their means, and below ours the published rows of the same labels.
+    """Return the rows of the table: our rows, then their means. A published row is below our rows with the same labels.
 
-    The entry `state` says why a run has no numbers.
+    If a run has no numbers, its entry `state` says why.
     """
     rows: list[Row] = []
     for outcome in outcomes:
@@ -30,7 +30,10 @@ def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Average rows over seeds, and over seeds and `mean_over`: of finished runs, and of numbers that all have."""
+    """Return means of rows: over seeds, and over both the seeds and the label `mean_over`.
+
+    Only finished runs count. A mean is given only for numbers that all rows have.
+    """
     result = []
     for over in dict.fromkeys(("seed", experiment.mean_over)):
         groups = dict[tuple, list[Outcome]]()
@@ -49,7 +52,10 @@ def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def headings(experiment: Experiment, outcomes: Sequence[Outcome], rows: Sequence[Row]) -> dict[str, str]:
-    """Name the columns of the table: labels, `by`, numbers, `state`. Empty columns are left out."""
+    """Return the headings of the table's columns: a dict by name. Order: labels, `by`, numbers, `state`.
+
+    Empty columns are left out.
+    """
     labels = [label for labelled in (*(o.run.labels for o in outcomes), *experiment.published) for label in labelled]
     own = {label: label for label in labels if label not in experiment.columns and label != "by"}
     numbers = {name: column.heading for name, column in experiment.columns.items() if any(name in row for row in rows)}
@@ -57,7 +63,7 @@ def headings(experiment: Experiment, outcomes: Sequence[Outcome], rows: Sequence
 
 
 def csv_text(names: Mapping[str, str], rows: Sequence[Row]) -> str:
-    """The table as CSV, with all digits. `names`: from `headings`."""
+    """Return the table as CSV, with all digits. `names`: headings from `headings`."""
     box = io.StringIO()
     writer = csv.DictWriter(box, list(names), extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -66,7 +72,7 @@ def csv_text(names: Mapping[str, str], rows: Sequence[Row]) -> str:
 
 
 def markdown(experiment: Experiment, names: Mapping[str, str], rows: Sequence[Row], command_line: str) -> str:
-    """The table as Markdown, with its subject above, and command line, computer and date below."""
+    """Return the table as Markdown. Its subject is above it. Command line, computer and date are below it."""
 
     def cell(name: str, value: Any) -> str:
         if isinstance(value, float) and name in experiment.columns:
