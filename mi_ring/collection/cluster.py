@@ -1,4 +1,4 @@
-"""Many fits at a time with Ray, on this machine or on a cluster."""
+"""Runs many fits at a time with Ray, on this machine or on a cluster."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ POLL = 1.0  #: interval between checks of the fits [s]
 
 @dataclass(frozen=True)
 class Resources:
-    """The resources of each fit, and the number of fits at a time."""
+    """The resources of each fit, and how many fits run at a time."""
 
     workers: int
     cpus: int  #: cores and threads of each fit
@@ -28,7 +28,10 @@ class Resources:
 
 @contextlib.contextmanager
 def ray_cluster(resources: Resources) -> Iterator[Any]:
-    """A context manager that starts Ray or connects to it. Raises InputError if Ray or the resources are missing."""
+    """Start Ray or connect to it, as a context manager. At the end, disconnects from it or stops it.
+
+    Raises InputError if Ray cannot be started or reached, or if no machine has the resources for a fit.
+    """
     ray = need("ray", "mi-ring batch")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"address": resources.address, "log_to_driver": False, "logging_level": "ERROR"}
@@ -54,10 +57,10 @@ def ray_cluster(resources: Resources) -> Iterator[Any]:
 
 
 def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, on_poll: Callable[[], None]) -> None:
-    """Fit all jobs on Ray. Returns when all have ended; their records then have the outcomes.
+    """Fit all jobs on Ray. Returns when all have ended. Their records then say how they ended.
 
-    `jobs`: fingerprints by job. `retries`: as in `fit_to_the_end`. `on_poll` is called about once a second. Ray
-    replaces a worker that dies; its fit resumes from the last checkpoint.
+    `jobs`: a dict from jobs to their fingerprints. `retries`: as for `fit_to_the_end`. `on_poll` is called about once a
+    second. If a worker dies, Ray replaces it, and its fit continues from the last checkpoint.
     """
     with ray_cluster(resources) as ray:
         fit = ray.remote(fit_to_the_end).options(

@@ -1,4 +1,4 @@
-"""One fit in a process of its own. If the process dies, it is started again from the last checkpoint."""
+"""Runs one fit in a process of its own. If this process dies, it is started again from the last checkpoint."""
 
 import contextlib
 import ctypes
@@ -22,9 +22,9 @@ def fit_to_the_end(
 ) -> Record:
     """Fit a scene, or continue its fit. Returns a record with the state done or failed.
 
-    A fit that dies is restarted, at most `retries` times in a row without progress. `fingerprint`: of the job.
-    `extra`: options that do not change the result. `on_line` is called with each printed line. After this process was
-    killed, call the function again.
+    If the fit's process dies, it is started again. After `retries` restarts without progress, the fit has failed.
+    `fingerprint`: that of the job. `extra`: options that do not change the result. `on_line` is called with each
+    printed line. If the calling process is killed, call the function again to continue.
     """
     record = job.record
     if record.fingerprint != fingerprint:  # the fit itself moves the results of the other fit aside
@@ -51,9 +51,9 @@ def fit_to_the_end(
 
 
 def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = None) -> tuple[int, str]:
-    """Run a fit and write its output to `job.output`. Returns its exit status and its last line.
+    """Run a fit, and write its output to `job.output`. Returns (exit status, last line of the output).
 
-    The fit ends if this process ends.
+    If this process ends, the fit ends, too.
     """
     cwd = job.cwd if job.cwd.is_dir() else None  # a worker on another machine may lack this folder
     options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -79,7 +79,10 @@ def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = No
 
 
 def die_with_parent() -> dict[str, Any]:
-    """Options of `Popen` that let the kernel kill the process when this process ends; only on Linux."""
+    """Return options of `Popen` with which the kernel kills the child process when this process ends.
+
+    Returns none on other systems than Linux.
+    """
     if not sys.platform.startswith("linux"):
         return {}
     prctl: Callable[..., int] = ctypes.CDLL(None).prctl

@@ -1,4 +1,4 @@
-"""Jobs: scenes to fit. A record beside the results has the state of each fit."""
+"""Jobs: scenes to fit. A record beside the results gives the state of each fit."""
 
 import contextlib
 import hashlib
@@ -33,7 +33,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Job:
-    """A scene, the folder of its results, and options of `mi_ring.fit`. The two paths are absolute."""
+    """A scene, the folder of its results, and the options of `mi_ring.fit`. The two paths are absolute."""
 
     scene: Path
     folder: Path
@@ -42,30 +42,30 @@ class Job:
 
     @property
     def name(self) -> str:
-        """The name of the results folder."""
+        """Name of the results folder."""
         return self.folder.name
 
     @property
     def output(self) -> Path:
-        """File with the printed output of the fit."""
+        """File that receives the printed output of the fit."""
         return self.folder.parent / RECORDS / f"{self.name}.txt"
 
     @property
     def record(self) -> Record:
-        """The last record. If it is missing or damaged: the record of a waiting job."""
+        """The last saved record. If it is missing or damaged, it is the record of a waiting job."""
         with contextlib.suppress(TypeError):
             return Record(**read_json(self.output.with_suffix(".json")))
         return Record()
 
     def save(self, record: Record) -> Record:
-        """Write a record and return it."""
+        """Write a record to its file, and return it."""
         path = self.output.with_suffix(".json")
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, json.dumps(asdict(record)))
         return record
 
     def fingerprint(self) -> str:
-        """Hash of the options, the scene file, and all files that they name."""
+        """Return a hash of the options, of the scene file, and of all files that options or scene file name."""
         result = hashlib.blake2b(repr(self.options).encode(), digest_size=16)
         with contextlib.suppress(OSError):  # the fit reports what is wrong with the scene file
             text = self.scene.read_bytes()
@@ -79,11 +79,11 @@ class Job:
         return result.hexdigest()
 
     def has_checkpoint(self, since: float) -> bool:
-        """Whether there is a checkpoint that is not older than the time `since`."""
+        """Return whether there is a checkpoint that was written at the time `since` or later."""
         return any(modified(self.folder / name) / 1e9 >= since for name in CHECKPOINTS)
 
     def iteration(self, since: float = 0.0) -> int:
-        """Last iteration in log.jsonl; 0 if the log is missing or older than the time `since`."""
+        """Return the last iteration in log.jsonl. Returns 0 if the log is missing or older than the time `since`."""
         with contextlib.suppress(OSError, KeyError, TypeError):
             if modified(self.folder / "log.jsonl") / 1e9 >= since:
                 return int(max((entry["iteration"] for entry in read_log(self.folder)), default=0))
@@ -91,7 +91,7 @@ class Job:
 
     @property
     def progress(self) -> str:
-        """The progress of a running fit, as text."""
+        """Progress of a running fit as text, for example "iteration 20 of 100"."""
         planned = ""
         with contextlib.suppress(OSError, IndexError):
             planned = re.findall(r"iteration \d+/(\d+)", self.output.read_text(errors="replace"))[-1]
@@ -99,14 +99,14 @@ class Job:
         return f"iteration {iteration}{' of ' * bool(planned)}{planned}" if iteration else "begins"
 
     def is_done(self, fingerprint: str) -> bool:
-        """Whether there are complete results for this fingerprint."""
+        """Return whether the folder has complete results for this fingerprint."""
         record, ring = self.record, modified(self.folder / "ring.pt")
         there = ring and (self.folder / "report.html").is_file()
         return bool(there) and (record.done, record.written) == (fingerprint, ring)
 
 
 def modified(path: Path) -> int:
-    """Modification time of a file [ns]; 0 if there is no such file."""
+    """Return the modification time of a file [ns]. Returns 0 if there is no such file."""
     try:
         return path.stat().st_mtime_ns
     except OSError:
@@ -114,7 +114,11 @@ def modified(path: Path) -> int:
 
 
 def make_jobs(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[Job]:
-    """A job for each scene. Raises InputError for missing files, equal names, and results that overwrite a scene."""
+    """Make a job for each scene. `out`: folder for the results of all jobs.
+
+    Raises InputError if a file is missing, if two jobs would have the same results folder, or if a results folder would
+    be one that contains the scene file.
+    """
     jobs: dict[str, Job] = {}
     for scene in scenes:
         require_file(scene, "the XML file of a scene")
