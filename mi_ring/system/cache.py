@@ -1,4 +1,4 @@
-"""The cache folder: files that can be made again, and that are removed when there are too many."""
+"""The cache folder. Its files can be made again. When there are too many, some are removed."""
 
 import contextlib
 import os
@@ -17,13 +17,16 @@ PRUNED = 0.8  #: share of the limit that is left after files were removed
 
 
 def cache_folder() -> Path:
-    """Return the folder of cached files: in the one that `MI_RING_CACHE` names, or in the user's cache folder."""
+    """Return the folder of our cached files.
+
+    It is in the folder that the environment variable `MI_RING_CACHE` names, or else in the user's cache folder.
+    """
     named = os.environ.get(VARIABLE)
     return (Path(named) if named else Path(platformdirs.user_cache_dir("mi_ring", appauthor=False))) / OWN
 
 
 def cached(key: str) -> Path | None:
-    """Return the file with this key, None if there is none. The file counts as used now."""
+    """Return the path of the file with this key, or None if there is none. The file is marked as used now."""
     path = cache_folder() / key
     with contextlib.suppress(OSError):  # in a folder that is only read
         os.utime(path)
@@ -31,7 +34,7 @@ def cached(key: str) -> Path | None:
 
 
 def store(key: str, content: bytes | memoryview) -> bool:
-    """Write a file with this key, 32 hexadecimal digits. Returns False if it cannot be written."""
+    """Write a file with this key, which is 32 hexadecimal digits. Returns False if it cannot be written."""
     from mi_ring.system.files import write_file  # which needs torch; the rest of this module does not
 
     try:
@@ -43,7 +46,7 @@ def store(key: str, content: bytes | memoryview) -> bool:
 
 
 def files() -> list[tuple[float, int, Path]]:
-    """List all files: when it was last used [s], size [bytes], path."""
+    """List all files in the cache. Returns (time of the last use [s], size [bytes], path) for each."""
     found = []
     with contextlib.suppress(OSError):  # there is no folder yet
         for path in cache_folder().iterdir():
@@ -54,12 +57,12 @@ def files() -> list[tuple[float, int, Path]]:
 
 
 def size() -> int:
-    """Return the size of all files [bytes]."""
+    """Return the total size of all files in the cache [bytes]."""
     return sum(own for _, own, _ in files())
 
 
 def prune(limit: int = LIMIT) -> None:
-    """Remove the files that were not used for the longest time, if all files are larger than the limit."""
+    """If the total size is above `limit` [bytes], remove the files that were not used for the longest time."""
     several = sorted(files())
     total = sum(own for _, own, _ in several)
     least = total if total <= limit else PRUNED * limit
@@ -72,7 +75,7 @@ def prune(limit: int = LIMIT) -> None:
 
 
 def empty() -> None:
-    """Remove all files."""
+    """Remove all files from the cache."""
     for _, _, path in files():
         with contextlib.suppress(OSError):
             path.unlink()

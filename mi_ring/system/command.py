@@ -1,4 +1,4 @@
-"""Shared by all commands: parsing of arguments, user errors in one line, signals, exit status."""
+"""What all commands share: parsing of arguments, user errors in one line, signals, exit status."""
 
 import ast
 import contextlib
@@ -32,10 +32,10 @@ def parse(
     config_type: Any, arguments: Sequence[str], program: str, default: Any = tyro.MISSING_NONPROP,
     description: str | None = None, needs_llvm: bool = True,
 ) -> Any:  # fmt: skip
-    """An instance of a dataclass, from the command line. Raises InputError for wrong arguments.
+    """Parse the arguments of a command. Returns an instance of `config_type`, which is a dataclass.
 
-    The help begins with `description`, by default the docstring of the dataclass. With `needs_llvm`, also raises
-    InputError if there is no LLVM, but not for --help.
+    `program`: name of the command in the help. `description`: beginning of the help; default: the docstring of the
+    dataclass. Raises InputError for wrong arguments. With `needs_llvm`, it also raises InputError if there is no LLVM.
     """
     for word in (*arguments, os.getcwd()):
         require_utf8(word)
@@ -53,16 +53,16 @@ def parse(
 
 
 def require_utf8(name: str) -> None:
-    """Raise InputError if a file name is not UTF-8; the file system allows any bytes."""
+    """Raise InputError if a file name is not UTF-8. The file system itself allows any bytes."""
     printable = os.fsencode(name).decode(errors="replace")
     if printable != name:
         raise InputError(f"{printable}: this name is not UTF-8, which Mitsuba and XML need; rename it")
 
 
 def complaint_in(box: str) -> str:
-    """The error message in the box that tyro prints, as one line.
+    """Return the error message in a box that tyro has printed, as one line.
 
-    The box has a title, the message, and advice, separated by horizontal rules. Two parts of the advice are used:
+    The box has a title, the message, and advice. Horizontal rules separate them. Two parts of the advice are used:
     options of similar spelling, and the help of the option. If the output is not UTF-8, the box has no sides.
     """
     if "│" in box:
@@ -83,7 +83,10 @@ def complaint_in(box: str) -> str:
 
 
 def plain(complaint: str, help_text: str) -> str:
-    """An error message of tyro in our form: option, value found, values allowed. `help_text`: help of the option."""
+    """Return an error message of tyro in our form: option, value found, values allowed.
+
+    `help_text`: help of the option.
+    """
     if wrong := re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", complaint):
         choices = wrong[3].replace("'", "").split(", ")
         alike = difflib.get_close_matches(wrong[1], choices)
@@ -110,27 +113,27 @@ def plain(complaint: str, help_text: str) -> str:
 
 
 def name_in_help(name: str) -> str:
-    """The name of an argument as the help shows it."""
+    """Return the name of an argument as the help shows it."""
     return name if name.startswith("--") else name.upper()
 
 
 def scene_name(scene: Path) -> str:
-    """The name of a scene: the file's name, or the folder's if the file is called scene.xml."""
+    """Return the name of a scene. It is that of the file without suffix, or that of the folder for a file scene.xml."""
     return scene.stem if scene.stem != "scene" else scene.resolve().parent.name
 
 
 def one_line(message: str) -> str:
-    """A message without line breaks. The middle of one that is longer than `MAX_MESSAGE` is left out."""
+    """Return a message without line breaks. If it is longer than `MAX_MESSAGE`, its middle is left out."""
     words = " ".join(message.split())
     return words if len(words) <= MAX_MESSAGE else f"{words[: MAX_MESSAGE // 2]} … {words[-MAX_MESSAGE // 2 :]}"
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised when one of the `SIGNALS` has arrived. The argument is its number."""
+    """Raised when one of the `SIGNALS` has arrived. Its argument is the number of the signal."""
 
 
 def exit_status(stop: KeyboardInterrupt) -> int:
-    """The exit status of an interrupted command: 128 + the signal's number."""
+    """Return the exit status of an interrupted command: 128 + the number of the signal."""
     return 128 + (stop.args[0] if isinstance(stop, Interrupted) else signal.SIGINT)
 
 
@@ -138,15 +141,16 @@ _received: list[tuple[int, float]] = []  #: signals within `resumable`: number, 
 
 
 def interrupted() -> bool:
-    """Whether a signal has arrived within `resumable`. Native code may have turned it into another error."""
+    """Return whether a signal has arrived within `resumable`. Native code may have turned it into another error."""
     return bool(_received)
 
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """A context manager for work that the same command can resume. On a signal of `SIGNALS` it prints that hint.
+    """A context manager for work that the same command can continue. If a signal of `SIGNALS` arrives, it says this.
 
-    It raises Interrupted even if a library turns the signal into another error. Only the main thread receives signals.
+    It then raises Interrupted, even if a library turns the signal into another error. Only the main thread receives
+    signals.
     """
 
     def receive(number: int, frame: object) -> None:
@@ -176,7 +180,7 @@ def resumable() -> Iterator[None]:
 
 
 def make_callable(module: str, function: Callable) -> None:
-    """Make the module of a command callable, so that `mi_ring.evaluate(…)` calls the function."""
+    """Make the module of a command callable. Then `mi_ring.evaluate(…)`, for example, calls `function`."""
 
     class CallableModule(ModuleType):
         __call__ = staticmethod(function)
@@ -185,9 +189,9 @@ def make_callable(module: str, function: Callable) -> None:
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
-    """Run a command and exit. A user error is one line on standard error and exit status 2.
+    """Run a command, and exit. A user error is printed as one line on standard error, and the exit status is 2.
 
-    With `--traceback` among the arguments the traceback is shown instead.
+    If `--traceback` is among the arguments, the traceback is printed instead.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     traceback = "--traceback" in arguments

@@ -1,4 +1,4 @@
-"""Writing files so that they are complete or absent; checksums; locks of folders."""
+"""Writes files such that they are complete or absent. Also checksums and locks of folders."""
 
 import contextlib
 import errno
@@ -26,7 +26,10 @@ END, COMMENT = b"PK\x05\x06", 20  #: of the last record of a zip file: signature
 
 @contextlib.contextmanager
 def writing(what: Path | str) -> Iterator[None]:
-    """A context manager that turns an OSError, such as a full disk, into an InputError that begins with `what`."""
+    """A context manager that turns an OSError, such as a full disk, into an InputError.
+
+    The message begins with `what`.
+    """
     try:
         yield
     except OSError as error:
@@ -35,28 +38,32 @@ def writing(what: Path | str) -> Iterator[None]:
 
 
 def require_place(path: Path, field: str = "") -> None:
-    """Make the folder of a file. Raises InputError if it is not writable. Call it before long work for the file."""
+    """Create the folder of the file `path`, and check that files can be written there. Raises InputError if not.
+
+    Call it before long work whose result goes to this file.
+    """
     with writing(f"{path}: {field}" if field else path):
         path.parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=path.parent).close()
 
 
 def relative_to(folder: Path, path: Path) -> str:
-    """A path relative to a folder, with forward slashes; absolute if it is on another drive (Windows)."""
+    """Return a path relative to a folder, with forward slashes. On another drive (Windows), it is absolute."""
     with contextlib.suppress(ValueError):
         path = Path(os.path.relpath(path, folder))
     return path.as_posix()
 
 
 def partial_path(path: Path) -> Path:
-    """A temporary file beside `path`, for the incomplete content. No other process uses this name."""
+    """Return a path beside `path` for the content while it is incomplete. No other process uses this path."""
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
 
 
 def write_file(path: Path, content: bytes | memoryview | str, durable: bool = False, keep: Path | None = None) -> None:
-    """Write a file so that it is complete or absent. Raises InputError if it cannot be written.
+    """Write a file such that it is complete or absent. Raises InputError if it cannot be written.
 
-    `durable`: it survives a power failure; slower. `keep`: new path for the old file of this name.
+    `durable`: the file survives a power failure; this is slower. `keep`: if the file exists already, the old one is
+    moved to this path.
     """
     partial = partial_path(path)
     with writing(path):
@@ -80,7 +87,10 @@ def write_file(path: Path, content: bytes | memoryview | str, durable: bool = Fa
 
 
 def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
-    """Write a dictionary by `torch.save`, with a checksum, by which `read_state` detects damage. See `write_file`."""
+    """Write a dictionary by `torch.save`, with a checksum. By it, `read_state` detects damage.
+
+    `keep`: see `write_file`.
+    """
     buffer = io.BytesIO()
     torch.save(state | {"sealed": True}, buffer)
     seal(buffer)
@@ -88,7 +98,7 @@ def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
 
 
 def seal(archive: io.BytesIO) -> None:
-    """Add a comment to a zip file that holds the checksum of everything before it."""
+    """Add a comment to a zip file. It contains the checksum of everything before it."""
     end = archive.seek(-COMMENT - 2, os.SEEK_END)
     assert archive.read(len(END)) == END, "it has a comment already"
     archive.seek(end + COMMENT)
@@ -97,18 +107,18 @@ def seal(archive: io.BytesIO) -> None:
 
 
 def is_sealed(archive: bytes) -> bool:
-    """Does a zip file end with the checksum of `seal`, and is the checksum right?"""
+    """Return whether a zip file ends with the checksum of `seal`, and whether this checksum is right."""
     body = memoryview(archive)[: max(0, len(archive) - len(SEAL) - DIGEST)]
     return archive[len(body) :] == SEAL + fingerprint(body)
 
 
 def fingerprint(content: bytes | memoryview) -> bytes:
-    """The BLAKE2b checksum in `DIGEST` hexadecimal digits."""
+    """Return the BLAKE2b checksum of `content`, as `DIGEST` hexadecimal digits."""
     return hashlib.blake2b(content, digest_size=DIGEST // 2).hexdigest().encode()
 
 
 def digest(file: Path) -> str:
-    """A hash of a file's content."""
+    """Return a hash of the content of a file."""
     result = hashlib.blake2b(digest_size=16)
     with file.open("rb") as stream:
         while block := stream.read(2**20):
@@ -117,7 +127,7 @@ def digest(file: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file that we wrote; None if it does not exist or is damaged."""
+    """Return the content of a JSON file that we wrote. Returns None if the file does not exist or is damaged."""
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -125,16 +135,17 @@ def read_json(path: Path) -> Any:
 
 
 def quoted(content: bytes) -> list[str]:
-    """The quoted strings of an XML file. They include the names of all files that it refers to."""
+    """Return the quoted strings of an XML file. Among them are the names of all files that it refers to."""
     strings = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", content)
     return [(double or single).decode(errors="replace") for double, single in strings]
 
 
 @contextlib.contextmanager
 def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[None]:
-    """Lock a folder, as a context manager. If another process has the lock, raise InputError, or wait if `wait`.
+    """Lock a folder, as a context manager.
 
-    The lock file is beside the folder, so the folder may be moved. The lock ends with the process.
+    If another process has locked it, raises InputError. With `wait`, it waits instead. The lock is a file beside the
+    folder, so that the folder can be moved. The lock ends with the process.
     """
     place = folder.resolve()
     file = place.with_name(f".{place.name}.lock")
@@ -164,9 +175,10 @@ def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[N
 
 @contextlib.contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """A context manager with a temporary folder that is renamed to `folder` at the end, and removed after an error.
+    """A context manager that gives a temporary folder. At the end, it renames this folder to `folder`.
 
-    `folder` must then be missing or empty. Raises InputError if something cannot be written.
+    `folder` must then be missing or empty. After an error, the temporary folder is removed. Raises InputError if
+    something cannot be written.
     """
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)

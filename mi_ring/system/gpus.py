@@ -1,4 +1,4 @@
-"""Chooses the GPU of each process of a distributed fit. This must happen before anything initialises CUDA."""
+"""Chooses the GPU of each process of a distributed fit. It must do this before anything initialises CUDA."""
 
 import os
 import sys
@@ -8,9 +8,9 @@ OWN = "MI_RING_OWN_GPU"  #: environment variable: 1 if no other process of the s
 
 
 def choose_gpu() -> None:
-    """Let each process that `torchrun` started on this machine see only one GPU, chosen by its rank.
+    """Hide all GPUs but one from this process, if `torchrun` started several on this machine. Its rank chooses the GPU.
 
-    Only for mi_ring's own command, not for other programs that import mi_ring.
+    It does so only for the commands of mi_ring, not for other programs that import mi_ring.
     """
     if not any(word in ("mi_ring", "mi_ring.fit") or Path(word).stem == "mi-ring" for word in sys.orig_argv):
         return

@@ -36,9 +36,9 @@ _too_late = False  # Dr.Jit was imported before `prepare`
 
 
 def prepare() -> None:
-    """Choose Dr.Jit's LLVM with the environment variable `DRJIT_LIBLLVM_PATH`. Call it before Dr.Jit is imported.
+    """Choose the LLVM of Dr.Jit by the environment variable `DRJIT_LIBLLVM_PATH`. Call it before Dr.Jit is imported.
 
-    It keeps a value of the user. If no library is usable, it sets nothing; see `missing`.
+    If the user has set the variable, it is kept. If no library is usable, it is not set; see `missing`.
     """
     global _too_late
     _too_late = "drjit" in sys.modules
@@ -50,7 +50,7 @@ def prepare() -> None:
 
 
 def missing() -> str | None:
-    """What Mitsuba's variants `llvm_*` need and this machine lacks, with advice; None if they can run.
+    """Return None if Mitsuba's variants `llvm_*` can run. Otherwise return what this machine lacks, and advice.
 
     Call it after `prepare`. Without libatomic, Dr.Jit cannot be imported.
     """
@@ -84,7 +84,10 @@ def missing() -> str | None:
 
 
 def cure(package: str, more: str = "") -> str:
-    """A sentence that says how to install the library of a Debian package on this machine. It ends with `more`."""
+    """Return a sentence that says how to install the library of a Debian package on this machine.
+
+    It ends with `more`.
+    """
     installers = {"darwin": "brew install llvm", "win32": "winget install LLVM.LLVM"}
     if sys.platform in installers:
         return f"Run `{installers[sys.platform]}`{more}."
@@ -93,9 +96,9 @@ def cure(package: str, more: str = "") -> str:
 
 
 def libraries(folders: list[str] | None = None) -> list[tuple[int, str]]:
-    """The LLVM libraries in `folders` (glob patterns) as (major version, path), the newest first.
+    """Return the LLVM libraries in `folders` (glob patterns) as (major version, path), the newest first.
 
-    Default: those of the system, then the private copy. Versions are read from file names, without loading the files.
+    Default: those of the system, then the private copy. The version comes from the file name. No file is loaded.
     """
     if folders is None:
         return libraries(_system_folders()) + libraries([f"{glob.escape(str(PRIVATE))}/**"])
@@ -121,7 +124,7 @@ def _system_folders() -> list[str]:
 
 
 def find(folders: list[str] | None = None) -> str | None:
-    """The first library of `libraries(folders)` that is new enough and can be loaded; None if there is none."""
+    """Return the first of `libraries(folders)` that is new enough and can be loaded. Returns None if there is none."""
     if sys.platform == "win32" and folders is None:  # file names there do not contain the version
         places = shutil.which("LLVM-C.dll"), r"C:\Program Files\LLVM\bin\LLVM-C.dll"
         return next((path for path in places if path and os.path.exists(path)), None)
@@ -129,7 +132,7 @@ def find(folders: list[str] | None = None) -> str | None:
 
 
 def loads(path: str | Path) -> bool:
-    """Load a shared library for the rest of the process. False if that fails, e.g. for another architecture."""
+    """Load a shared library for the rest of the process. Returns False if this fails, e.g. for another architecture."""
     try:
         ctypes.CDLL(str(path))
         return True
@@ -138,12 +141,12 @@ def loads(path: str | Path) -> bool:
 
 
 def has_atomic() -> bool:
-    """Whether libatomic can be loaded. Dr.Jit needs it on Linux; small containers do not have it."""
+    """Return whether libatomic can be loaded. Dr.Jit needs it on Linux. Small containers do not have it."""
     return sys.platform != "linux" or loads("libatomic.so.1")
 
 
 def preload(folder: Path) -> None:
-    """Load the shared libraries in `folder`, except LLVM, each after its dependencies.
+    """Load the shared libraries in `folder`, except LLVM. The dependencies of a library are loaded before it.
 
     The dynamic loader does not search this folder, but it accepts libraries that are already loaded.
     """
@@ -153,9 +156,9 @@ def preload(folder: Path) -> None:
 
 
 def install(target: Path = PRIVATE) -> str:
-    """Make LLVM and libatomic available. Returns one line that says where they are.
+    """Make LLVM and libatomic available. Returns a line that says where they are.
 
-    If one is missing, packages are unpacked into the folder `target`. Raises RuntimeError if that fails.
+    If one of them is missing, packages are unpacked into the folder `target`. Raises RuntimeError if this fails.
     """
     preload(target)
     path, packages = os.environ.get(VARIABLE) or find(), []
@@ -172,11 +175,12 @@ def install(target: Path = PRIVATE) -> str:
 
 
 def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
-    """Unpack Debian or Ubuntu packages into the folder `target`, which is replaced. Returns the packages' names.
+    """Unpack Debian or Ubuntu packages into the folder `target`. Returns the names of the packages.
 
-    `alternatives`: lists of packages. The first list that the archive has is used, with its dependencies; installed
-    packages are left out. No root rights are needed: apt's lists and cache are in a temporary folder. `target` is
-    complete or absent. Raises RuntimeError if there is no apt or if it fails.
+    `target` is replaced. After an error, it is as before or absent, never incomplete. `alternatives`: lists of
+    packages. The first list that the archive has is used, with its dependencies. Packages that are installed are left
+    out. No root rights are needed, because apt's lists and cache are in a temporary folder. Raises RuntimeError if
+    there is no apt or if it fails.
     """
     if not shutil.which("apt-get"):
         raise RuntimeError(

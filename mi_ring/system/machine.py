@@ -1,4 +1,4 @@
-"""The computing resources of a fit: Mitsuba's variant, cores, threads, precision, memory."""
+"""What a fit computes with: Mitsuba's variant, cores, threads, precision, memory."""
 
 import contextlib
 import ctypes
@@ -28,14 +28,14 @@ LARGE_ARRAY = 2**25  #: bytes from which freed arrays go back to the system; the
 
 
 def device() -> torch.device:
-    """The device on which the current variant of Mitsuba computes. Tensors there need not be copied."""
+    """Return the device on which the current variant of Mitsuba computes. Tensors on it need not be copied."""
     return torch.device("cuda" if str(mi.variant()).startswith("cuda") else "cpu")
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
-    """Whether matrix products are faster in bfloat16 than in float32. Most processors emulate bfloat16.
+    """Return whether matrix products are faster in bfloat16 than in float32. Most processors only emulate bfloat16.
 
-    The features of the processor decide, not a measurement, so that fits can be repeated exactly.
+    It looks at the features of the processor. It measures nothing, so that a fit can be repeated exactly.
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -52,16 +52,20 @@ def has_fast_bfloat16(device: torch.device) -> bool:
 
 
 def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.AbstractContextManager]:
-    """A context manager for matrix products in this precision. `auto`: the faster one."""
+    """Return a function that makes a context manager for matrix products in this `precision`.
+
+    `auto`: the faster one of float32 and bfloat16.
+    """
     if precision == "bfloat16" or (precision == "auto" and has_fast_bfloat16(device)):
         return lambda: torch.autocast(device.type, torch.bfloat16)
     return contextlib.nullcontext
 
 
 def set_variant(variant: str) -> str:
-    """Switch Mitsuba to a variant and return its name. Without a usable GPU, a CUDA variant becomes `llvm_ad_rgb`.
+    """Switch Mitsuba to a variant. Returns the name of the variant that is then set.
 
-    Raises InputError if the variant needs LLVM and there is none.
+    Without a usable GPU, a CUDA variant is replaced by `llvm_ad_rgb`, and a message is printed. Raises InputError if
+    the variant needs LLVM and there is none.
     """
     reason = None
     if variant.startswith("cuda"):
@@ -85,14 +89,17 @@ def set_variant(variant: str) -> str:
 
 
 def cores() -> int:
-    """The number of processor cores that this process may use: by its affinity and its container's quota."""
+    """Return the number of processor cores that this process may use, by its affinity and its container's quota."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux
     count = len(affinity(0)) if affinity else os.cpu_count() or 1
     return max(1, math.ceil(min(count, cpu_quota(Path("/sys/fs/cgroup")))))
 
 
 def in_threads(function: Callable[..., Result], *things: Iterable, most: int | None = None) -> Iterator[Result]:
-    """Call `function` like `map`, in threads, one per core and at most `most`; it must release Python's global lock."""
+    """Call `function` like `map`, but in threads: one per core, and at most `most`. Yields the results in order.
+
+    It is of use only if `function` releases Python's global lock.
+    """
     with ThreadPoolExecutor(min(cores(), most or cores())) as pool:
         yield from pool.map(function, *things)
 
@@ -100,9 +107,10 @@ def in_threads(function: Callable[..., Result], *things: Iterable, most: int | N
 def pipelined(
     first: Callable[[Thing], Part], second: Callable[[Thing, Part], Result], things: Iterable[Thing]
 ) -> Iterator[Result]:
-    """Compute `second(thing, first(thing))` of each thing. `second` runs in another thread, during the next `first`.
+    """Yield `second(thing, first(thing))` for each thing.
 
-    If Dr.Jit has one thread, both run in this thread: `exr_threads` must not change the number during rendering.
+    `second` runs in another thread, at the same time as `first` of the next thing. But if Dr.Jit has one thread, both
+    run in this thread, because `exr_threads` must not change the number during rendering.
     """
     if dr.thread_count() < EXR_THREADS:
         for thing in things:
@@ -120,7 +128,7 @@ def pipelined(
 
 
 def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Make a long native call in another thread, so that Ctrl-C works at once. Returns its result."""
+    """Make a long native call in another thread. Returns its result. Ctrl-C then works at once."""
     future = ThreadPoolExecutor(1).submit(call, *arguments, **options)
     while not wait([future], 0.1).done:
         pass
@@ -128,9 +136,9 @@ def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) 
 
 
 def cpu_quota(root: Path) -> float:
-    """The number of cores that the control groups below `root` allow this process; infinite without a limit.
+    """Return the number of cores that the control groups below `root` allow this process.
 
-    Parent groups limit it too: https://docs.kernel.org/admin-guide/cgroup-v2.html
+    It is infinite if there is no limit. Parent groups limit it, too: https://docs.kernel.org/admin-guide/cgroup-v2.html
     """
     groups = [root]
     with contextlib.suppress(OSError):
@@ -148,13 +156,16 @@ def cpu_quota(root: Path) -> float:
 
 
 def set_threads(count: int = 0) -> None:
-    """Set the number of threads of torch and Dr.Jit. 0: all `cores`."""
+    """Set the number of threads of torch and Dr.Jit. 0: as many as `cores`."""
     torch.set_num_threads(count or cores())
     dr.set_thread_count(count or cores())
 
 
 def computer() -> str:
-    """The GPU, if the current variant uses one, the model of the processor and the number of `cores`."""
+    """Return a text with the model of the processor and the number of `cores`, for reports.
+
+    If the current variant uses a GPU, the text begins with its name.
+    """
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -166,9 +177,9 @@ def computer() -> str:
 
 @contextlib.contextmanager
 def threads_of(count: int = 0) -> Iterator[None]:
-    """A context manager in which torch and Dr.Jit use this number of threads. 0: all `cores`.
+    """A context manager in which torch and Dr.Jit use `count` threads. 0: as many as `cores`.
 
-    Only one thread is deterministic: the order of parallel sums varies.
+    Only one thread gives exactly the same results each time. With more threads, the order of sums varies.
     """
     before = torch.get_num_threads(), dr.thread_count()
     set_threads(count)
@@ -181,7 +192,7 @@ def threads_of(count: int = 0) -> Iterator[None]:
 
 @contextlib.contextmanager
 def exr_threads() -> Iterator[None]:
-    """A context manager in which Dr.Jit has at least `EXR_THREADS` threads, for reading or writing an EXR."""
+    """A context manager in which Dr.Jit has at least `EXR_THREADS` threads. Use it to read or write an EXR."""
     with _exr_lock:  # another thread may have raised the number for a moment
         before = dr.thread_count()
     if before >= EXR_THREADS:
@@ -196,7 +207,7 @@ def exr_threads() -> Iterator[None]:
 
 
 def glibc(name: str) -> Callable[..., int]:
-    """A function of glibc; on other systems (macOS, musl, Windows) a function that does nothing."""
+    """Return a function of glibc. On other systems (macOS, musl, Windows), returns a function that does nothing."""
     try:
         return getattr(ctypes.CDLL(None), name)
     except (AttributeError, TypeError, OSError):
@@ -204,13 +215,16 @@ def glibc(name: str) -> Callable[..., int]:
 
 
 def keep_memory() -> None:
-    """Let glibc keep the memory of freed arrays, but of large ones: new pages from the system are slow."""
+    """Tell glibc to keep the memory of freed arrays, because new pages from the system are slow.
+
+    Arrays of `LARGE_ARRAY` bytes or more are still given back.
+    """
     mallopt = glibc("mallopt")
     mallopt(M_MMAP_THRESHOLD, LARGE_ARRAY)
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 def release_memory() -> None:
-    """Return freed memory to the system. It may be half of the memory of a fit."""
+    """Return freed memory to the system. It may be half of the memory that a fit has."""
     dr.flush_malloc_cache()
     glibc("malloc_trim")(0)

@@ -1,4 +1,4 @@
-"""Packages that are not available for every machine. They are imported when they are needed."""
+"""Imports packages that are not available for every machine. They are imported only when they are needed."""
 
 import contextlib
 import importlib.util
@@ -12,14 +12,14 @@ from mi_ring.errors import InputError
 
 
 def installed(package: str) -> bool:
-    """Whether this package can be imported."""
+    """Return whether this package can be imported."""
     return importlib.util.find_spec(package) is not None
 
 
 def need(package: str, what: str, distribution: str | None = None) -> ModuleType:
-    """Import a package. If it is not installed, raises InputError, which begins with its use, `what`.
+    """Import a package, and return it. Raises InputError if it is not installed.
 
-    `distribution`: its name for pip, if that differs.
+    The message begins with `what`, which says what needs the package. `distribution`: the name for pip, if it differs.
     """
     try:
         with keeping_handlers():  # pycolmap installs its own
@@ -33,7 +33,7 @@ def need(package: str, what: str, distribution: str | None = None) -> ModuleType
 
 @contextlib.contextmanager
 def keeping_handlers() -> Iterator[None]:
-    """A context manager that restores the handler of SIGTERM, which some libraries replace."""
+    """A context manager that restores the handler of SIGTERM at its end. Some libraries replace this handler."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield
@@ -43,7 +43,7 @@ def keeping_handlers() -> Iterator[None]:
 
 
 class LazyPackage:
-    """A package that `need` imports when it is first used."""
+    """Stands for a package. When it is first used, `need` imports the package."""
 
     def __init__(self, package: str, what: str) -> None:
         self.package, self.what = package, what

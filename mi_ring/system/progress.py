@@ -18,7 +18,7 @@ DELAY, LOG_INTERVAL = 2.0, 30.0  #: seconds before the first line in a log, and 
 
 @contextlib.contextmanager
 def tolerating_closed_output() -> Iterator[None]:
-    """A context manager that drops output which cannot be written, such as after `| head` or in a closed terminal."""
+    """A context manager that drops output that cannot be written, such as after `| head` or in a closed terminal."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (stream and TolerantStream(stream) for stream in before)  # None: there is no console
     try:
@@ -34,7 +34,7 @@ def tolerating_closed_output() -> Iterator[None]:
 
 
 class TolerantStream:
-    """A text stream that drops text which cannot be written, and all text after its reader is gone."""
+    """A text stream that drops text that cannot be written. Once its reader is gone, it drops all text."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -43,16 +43,16 @@ class TolerantStream:
         return getattr(self.stream, name)
 
     def write(self, text: str) -> int:
-        """Write text if that is possible."""
+        """Write text if this is possible. Returns the length of the text in any case."""
         self.attempt(self.stream.write, text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush if that is possible."""
+        """Flush the stream if this is possible."""
         self.attempt(self.stream.flush)
 
     def attempt(self, operation: Callable[..., object], *arguments: Any) -> None:
-        """Call an operation of the stream; ignore its OSError."""
+        """Call an operation of the stream, and ignore its OSError."""
         try:
             operation(*arguments)
         except OSError as error:
@@ -60,47 +60,50 @@ class TolerantStream:
                 self.discard()
 
     def discard(self) -> None:
-        """Send the buffered text, and all that follows, to the null device: it would fail again at exit."""
+        """Send the buffered text, and all text that follows, to the null device.
+
+        Otherwise, writing the buffered text would fail again at exit.
+        """
         with contextlib.suppress(OSError), open(os.devnull, "w") as null:
             os.dup2(null.fileno(), self.stream.fileno())
 
 
 class LogBar(tqdm):
-    """A progress bar for a log: a line every `LOG_INTERVAL` seconds, and one at the end."""
+    """A progress bar for a log. It writes a line every `LOG_INTERVAL` seconds, and one at the end."""
 
     written, line = -math.inf, ""  #: when the last line was written [s], and its text
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
-        """Write a line if it is time; called by tqdm."""
+        """Write a line if `LOG_INTERVAL` is over. tqdm calls this method."""
         if msg is None and time.monotonic() - self.written >= LOG_INTERVAL:
             self.write_line()
 
     def write_line(self) -> None:
-        """Write the state as a line, unless that is the last line already."""
+        """Write the progress as a line. If the last line is the same, nothing is written."""
         if (line := str(self).strip()) != self.line:
             self.fp.write(f"{line}\n")
             self.fp.flush()
             self.written, self.line = time.monotonic(), line
 
     def clear(self, *arguments: Any, **options: Any) -> None:
-        """Do nothing: a log is not erased."""
+        """Do nothing. tqdm calls this method to erase a bar, but a log is not erased."""
 
     def close(self) -> None:
-        """Write the last line, if there were others."""
+        """Write a last line, if lines were written before."""
         if not self.disable and self.line:
             self.write_line()
         super().close()
 
 
 class Step(NamedTuple):
-    """A step of a command, for progress bars: its name and how long it takes."""
+    """A step of a command, for progress bars: the names of its bars, and how long it takes."""
 
     bars: tuple[str, ...]  #: what the names of its progress bars begin with
     seconds: float  #: that it is likely to take; only the ratios of steps matter
 
 
 class Steps:
-    """The steps of a command, as a context manager: progress bars say which step this is and how long all will take."""
+    """The steps of a command, as a context manager. Progress bars then show the step and the time that is left."""
 
     current: ClassVar["Steps | None"] = None  #: those of the command that runs
 
@@ -115,7 +118,10 @@ class Steps:
         Steps.current = None
 
     def named(self, what: str) -> str:
-        """The name of a progress bar with its step. A bar of no step, or of one that is over, keeps its name."""
+        """Return the name for a progress bar, with its step and the time that all steps still need.
+
+        If the bar belongs to no step, or to a step that is over, its name does not change. `what`: the bar's name.
+        """
         ahead = range(self.number, len(self.steps))
         found = next((n for n in ahead if what.startswith(self.steps[n].bars)), None)
         if found is None:
@@ -131,9 +137,9 @@ class Steps:
 def progress(
     things: Iterable | None, what: str = "", total: float | None = None, leave: bool = False, **options: Any
 ) -> tqdm:
-    """Iterate over `things` and show the progress; `options` are those of tqdm.
+    """Iterate over `things`, and show the progress. `what`: name of the bar. `options`: those of tqdm.
 
-    A terminal shows a bar. A log gets a line every 30 seconds, and none for less than two seconds of work.
+    In a terminal, it is a bar. In a log, it is a line every 30 seconds. Work of less than two seconds gets no line.
     """
     kind, what = tqdm, Steps.current.named(what) if Steps.current else what
     if not getattr(sys.stderr, "isatty", bool)():
