@@ -1,4 +1,4 @@
-"""Cameras, with or without lens distortion, as numpy arrays; `mi_ring.rendering.pinhole` is the same in Dr.Jit."""
+"""Cameras as numpy arrays, with or without lens distortion. `mi_ring.rendering.pinhole` does the same in Dr.Jit."""
 
 from typing import Any, NamedTuple
 
@@ -14,11 +14,11 @@ FARTHEST = 50  #: sizes of the picture from which a principal point may be
 
 
 class NoParallax(InputError):
-    """All cameras are at one place or look along one line, so that the object's distance is unknown."""
+    """Raised if all cameras are at one place or look along one line. The distance of the object is then unknown."""
 
 
 def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Move a camera-to-world pose (4, 4) to another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+    """Return a camera-to-world pose (4, 4) in another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
     moved = np.eye(4)
     moved[:3, :3] = rotation @ pose[:3, :3]
     moved[:3, 3] = scale * rotation @ pose[:3, 3] + shift
@@ -26,11 +26,11 @@ def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.n
 
 
 def undistortion_factor(distortion: Any, distance2: Any) -> Any:
-    """The factor that removes lens distortion from a point's vector from the picture's centre.
+    """Return the factor that removes lens distortion. It multiplies the vector from the picture's centre to a point.
 
-    `distance2` is the squared length of the distorted vector [focal lengths²]. The factor s solves
-    s (1 + `distortion` s² `distance2`) = 1 by Newton's method, between `MIN_DISTORTION` and `MAX_DISTORTION`. Arguments
-    are arrays of numpy, torch or Dr.Jit.
+    `distance2`: squared length of the distorted vector [focal lengths²]. The factor s solves s (1 + `distortion` s²
+    `distance2`) = 1. Newton's method finds it, if `distortion` · `distance2` is between `MIN_DISTORTION` and
+    `MAX_DISTORTION`. Arguments are arrays of numpy, torch or Dr.Jit.
     """
     k = distortion * distance2
     factor = 1 / (1 + k)
@@ -40,19 +40,20 @@ def undistortion_factor(distortion: Any, distance2: Any) -> Any:
 
 
 def distortion_factor(distortion: Any, distance2: Any) -> tuple[Any, Any]:
-    """The factor by which lens distortion scales a point's vector from the picture's centre; and is the point visible?
+    """Return the factor of lens distortion, and whether the point is visible.
 
-    `distance2` is the squared length of the undistorted vector [focal lengths²]. A point is not visible beyond the
-    distance at which the lens folds. Arguments are arrays of numpy, torch or Dr.Jit.
+    The factor multiplies the vector from the picture's centre to the point. `distance2`: squared length of the
+    undistorted vector [focal lengths²]. A point is not visible if it is beyond the distance at which the lens folds.
+    Arguments are arrays of numpy, torch or Dr.Jit.
     """
     k = distortion * distance2
     return 1 + k, 1 + 3 * k > 0
 
 
 def distortion_range(focal: Any, centre: Any, size: Any) -> tuple[Any, Any]:
-    """The lowest and the highest distortion (...) that `undistortion_factor` can remove in the whole picture.
+    """Return the lowest and the highest distortion (...) that `undistortion_factor` can remove in the whole picture.
 
-    `focal`, `centre`, `size`: (..., 2) [px], of numpy or torch.
+    `focal`, `centre`, `size`: (..., 2) [px], arrays of numpy or torch.
     """
     corner = (abs(centre - size / 2) + size / 2) / focal
     corner2 = (corner**2).sum(-1)
@@ -60,7 +61,7 @@ def distortion_range(focal: Any, centre: Any, size: Any) -> tuple[Any, Any]:
 
 
 class Camera(NamedTuple):
-    """A camera. The picture spans [0, W] × [0, H], x right, y down; the first pixel's centre is (0.5, 0.5)."""
+    """A camera. The picture spans [0, W] × [0, H], x right, y down. The centre of the first pixel is (0.5, 0.5)."""
 
     to_world: np.ndarray  #: (4, 4) camera-to-world, Mitsuba's axes: x left, y up, z forward
     focal: np.ndarray  #: (2,) focal lengths [px]
@@ -71,42 +72,42 @@ class Camera(NamedTuple):
 
     @property
     def position(self) -> np.ndarray:
-        """The camera's centre of projection (3,) [scene units]."""
+        """Centre of projection (3,) [scene units]."""
         return self.to_world[:3, 3]
 
     @property
     def forward(self) -> np.ndarray:
-        """The viewing direction (3,), unit length."""
+        """Viewing direction (3,) of length 1."""
         return self.to_world[:3, 2]
 
     @property
     def up(self) -> np.ndarray:
-        """The up direction of the picture (3,), unit length."""
+        """Up direction (3,) of the picture, of length 1."""
         return self.to_world[:3, 1]
 
     @property
     def projection(self) -> np.ndarray:
-        """The matrix (3, 4) that maps (x, y, z, 1) to (pixel x · depth, pixel y · depth, depth); without distortion."""
+        """Matrix (3, 4) that maps (x, y, z, 1) to (pixel x · depth, pixel y · depth, depth). It ignores distortion."""
         across = self.to_world[:3, :2] * -self.focal + np.outer(self.forward, self.centre)
         rows = np.column_stack([across, self.forward]).T
         return np.column_stack([rows, -rows @ self.position])
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
-        """Unit directions (n, 3) in the world of the rays through pixel coordinates (n, 2)."""
+        """Return the directions (n, 3) of the rays through pixel coordinates (n, 2), in the world, of length 1."""
         x, y = self.undistorted((pixels - self.centre) / self.focal).T
         d = np.stack([-x, -y, np.ones_like(x)], 1) @ self.to_world[:3, :3].T
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
     def undistorted(self, places: np.ndarray) -> np.ndarray:
-        """Remove lens distortion from vectors `places` (..., 2) from the picture's centre [focal lengths]."""
+        """Remove lens distortion from `places` (..., 2): vectors from the picture's centre [focal lengths]."""
         if not self.distortion:
             return places
         return places * undistortion_factor(self.distortion, np.square(places).sum(-1, keepdims=True))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel coordinates (n, 2) and depths (n,) along the optical axis [scene units] of points (n, 3).
+        """Project points (n, 3). Returns pixel coordinates (n, 2) and depths (n,) along the optical axis [scene units].
 
-        Pixel coordinates are NaN beyond the distance from the centre at which the lens folds.
+        Pixel coordinates are NaN for a point beyond the distance from the centre at which the lens folds.
         """
         x, y, z = np.linalg.solve(self.to_world[:3, :3], (points - self.position).T)
         with np.errstate(divide="ignore", invalid="ignore"):  # the depth may be 0
@@ -116,24 +117,27 @@ class Camera(NamedTuple):
             return self.centre - self.focal * places, z
 
     def cosines(self) -> np.ndarray:
-        """Cosines (H, W) of the angles between the pixels' rays and the optical axis."""
+        """Return the cosines (H, W) of the angles between the rays of the pixels and the optical axis."""
         width, height = self.size
         y, x = np.mgrid[:height, :width]
         places = self.undistorted((np.stack([x, y], -1) + 0.5 - self.centre) / self.focal)
         return (1 + np.square(places).sum(-1)) ** -0.5
 
     def shrunk(self, scale: int) -> "Camera":
-        """The camera of the same photograph at 1 / `scale` of its size."""
+        """Return the camera of the same photograph at 1 / `scale` of its size."""
         size = self.size[0] // scale, self.size[1] // scale
         return self._replace(focal=self.focal / scale, centre=self.centre / scale, size=size)
 
     @property
     def key(self) -> tuple[bytes, ...]:
-        """A key for dictionaries: equal cameras have equal keys."""
+        """Key for dictionaries. Equal cameras have equal keys."""
         return tuple(np.asarray(part).tobytes() for part in self)
 
     def fault(self) -> str | None:
-        """What is wrong with principal point, distortion or pose, as a scene file names them; None if nothing is."""
+        """Return what is wrong with principal point, distortion or pose, as text. None if nothing is wrong.
+
+        The text uses the names of fields in scene files.
+        """
         if (far := np.abs(self.centre / np.array(self.size))).max() > FARTHEST:
             k = int(far.argmax())
             return (f"{('cx', 'cy')[k]} is {self.centre[k]:g}, which is more than {FARTHEST} times its film away; is "
@@ -150,9 +154,10 @@ class Camera(NamedTuple):
 
 
 def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:
-    """The point (3,) nearest to lines `origins` (n, 3) + t · `directions` (n, 3), in the least-squares sense.
+    """Return the point (3,) that is nearest to several lines in the least-squares sense.
 
-    Raises NoParallax, whose message begins with `what`, if the lines do not determine a point.
+    The lines are `origins` (n, 3) + t · `directions` (n, 3). Raises NoParallax if they do not determine a point. The
+    message begins with `what`.
     """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]

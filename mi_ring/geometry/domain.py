@@ -1,4 +1,4 @@
-"""Domains: the surfaces from which Shape-Net's flow starts and on which BRDF-Net is defined."""
+"""Domains. A domain is the surface from which Shape-Net's flow starts, and on which BRDF-Net is defined."""
 
 from functools import lru_cache
 
@@ -22,9 +22,10 @@ MAX_SAMPLES = 2**20  #: most points to take candidates from; from level 6 on, so
 def closed_domain(
     mesh: trimesh.Trimesh, center: ArrayLike | None = None, radius: float | None = None
 ) -> tuple["Domain", np.ndarray, float]:
-    """Make a closed mesh a domain, and find centre (3,) and radius of the normalising sphere [units of the mesh].
+    """Make a domain of a closed mesh. Returns (domain, centre (3,), radius) of the normalising sphere.
 
-    Default: the centre of the bounding box, and the mean distance of the vertices from it.
+    Centre and radius are in units of the mesh. By default, the centre is that of the bounding box, and the radius is
+    the mean distance of the vertices from it. If `mesh` is inside out, its faces are flipped.
     """
     if mesh.volume < 0:
         mesh.invert()
@@ -34,9 +35,9 @@ def closed_domain(
 
 
 def transfer_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Move `points` (N, 3) of a mesh along when its `vertices` (V, 3) move to `others` (V, 3).
+    """Move `points` (N, 3) of a mesh together with the mesh, and return them (N, 3).
 
-    Points beside the mesh are first projected to it.
+    The mesh's `vertices` (V, 3) move to `others` (V, 3). Points that are not on the mesh are first projected to it.
     """
     mesh = vertices.astype(float), faces.astype(np.int32)
     _, face, weights = gpytoolbox.squared_distance(points.astype(float), *mesh, use_cpp=True)
@@ -50,14 +51,17 @@ def normalized(vectors: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def samplings(kind: str, points: bytes, faces: bytes) -> tuple[dict, dict]:
-    """Meshes and candidates by level, shared by all domains of one surface: to remesh a hull takes seconds."""
+    """Return two dicts by level, for meshes and for candidates. All domains of one surface share them.
+
+    They are shared because it takes seconds to remesh a hull.
+    """
     return {}, {}
 
 
 class Domain:
     """A closed surface in the normalised frame, given as a mesh with vertices (V, 3) and faces (F, 3).
 
-    `sample` returns other meshes of the same surface, with nearly uniform triangles.
+    `sample` returns other meshes of the same surface. Their triangles are nearly uniform.
     """
 
     def __init__(self, points: ArrayLike, faces: ArrayLike) -> None:
@@ -68,9 +72,10 @@ class Domain:
         self.levels, self.candidates = samplings(type(self).__name__, self.points.tobytes(), self.faces.tobytes())
 
     def sample(self, level: int, random: torch.Generator | None = None) -> tuple[Tensor, np.ndarray]:
-        """Sample the surface: vertices (V, 3) and about 20 · 4^level faces (F, 3), as in an icosphere of this level.
+        """Return a mesh of the surface: vertices (V, 3) and faces (F, 3).
 
-        With `random`, each call moves the vertices to other points of the surface. The faces stay the same.
+        F is about 20 · 4^level, as in an icosphere of this level. If `random` is given, each call moves the vertices to
+        other points of the surface. The faces stay the same.
         """
         if level not in self.levels:
             vertices, triangles = self.triangulate(level)
@@ -79,7 +84,7 @@ class Domain:
         return (points if random is None else self.resample(level, points, random)), faces
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which points (N, 3) are inside the surface: (N,) bool."""
+        """Return which points (N, 3) are inside the surface: (N,) bool."""
         inside = np.linalg.norm(points, axis=1) < np.linalg.norm(self.points, axis=1).max()
         if inside.any():
             mesh = self.points.astype(float), self.faces.astype(np.int32)
@@ -87,11 +92,11 @@ class Domain:
         return inside
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points (N, 3) to the nearest points of the surface."""
+        """Return the points (N, 3) of the surface that are nearest to `points` (N, 3)."""
         return transfer_points(points, self.points, self.faces, self.points)
 
     def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and faces of a mesh of the surface with about 20 · 4^level triangles."""
+        """Make a mesh of the surface with about 20 · 4^level triangles. Returns (vertices, faces)."""
         if level > REMESHED:
             points, faces = trimesh.remesh.subdivide(*self.sample(level - 1))
             return self.project(points), faces
@@ -113,14 +118,14 @@ class Domain:
         return points, faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """Move each vertex (V, 3) to a random one of its candidates."""
+        """Return new positions (V, 3) of the vertices. Each is a random one of the vertex's candidates."""
         if level not in self.candidates:
             self.candidates[level] = self.find_candidates(level)
         chosen = torch.randint(CANDIDATES, (len(points),), generator=random)
         return self.candidates[level][torch.arange(len(points)), chosen]
 
     def find_candidates(self, level: int) -> Tensor:
-        """Find random points (V, CANDIDATES, 3) of the surface near each vertex of a level's mesh."""
+        """Return random points (V, CANDIDATES, 3) of the surface: candidates near each vertex of a level's mesh."""
         points, faces = self.sample(level)
         coarse = trimesh.Trimesh(points.numpy(), faces, process=False)
         fine = trimesh.Trimesh(self.points, self.faces, process=False)
@@ -143,7 +148,7 @@ class Domain:
 
 
 class Sphere(Domain):
-    """The unit sphere, sampled as an icosphere: 2,562 / 10,242 / 40,962 / 163,842 vertices at levels 4–7."""
+    """The unit sphere. It is sampled as an icosphere: 2,562 / 10,242 / 40,962 / 163,842 vertices at levels 4–7."""
 
     def __init__(self) -> None:
         icosahedron = trimesh.creation.icosahedron()
@@ -160,6 +165,6 @@ class Sphere(Domain):
         return mesh.vertices, mesh.faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """Rotate all vertices (V, 3) by one random rotation of the sphere."""
+        """Return the vertices (V, 3), all rotated by the same random rotation of the sphere."""
         rotation = Rotation.from_quat(torch.randn(4, generator=random).numpy()).as_matrix()
         return points @ torch.as_tensor(rotation, dtype=torch.float32).T

@@ -1,4 +1,4 @@
-"""The visual hull of masks: all points whose projections are inside the masks. A fit may start from it."""
+"""The visual hull of masks. It contains all points whose projections are inside the masks. A fit may start from it."""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ MAX_MASKS, MAX_WIDTH = 128, 512  #: limits of the number of silhouettes and thei
 
 
 class NoHull(InputError):
-    """No point in space is inside all masks."""
+    """Raised if no point in space is inside all masks."""
 
 
 class Silhouette(NamedTuple):
@@ -34,7 +34,7 @@ class Silhouette(NamedTuple):
 
     @property
     def whole(self) -> "Silhouette":
-        """The silhouette of the whole photograph: outside of this part its mask is empty."""
+        """The silhouette of the whole photograph. Outside of this part, its mask is empty."""
         if self.frame is None:
             return self
         before = np.ceil(-self.frame[0]).astype(int)
@@ -47,7 +47,7 @@ class Silhouette(NamedTuple):
 
 
 def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Reduce a mask (H, W) uint8 by a whole factor to at most this `width` [px]. Returns the mask and the factor."""
+    """Reduce a mask (H, W) uint8 by a whole factor, so that it is at most `width` [px] wide. Returns (mask, factor)."""
     scale = -(-mask.shape[1] // width)
     height, width = (n // scale for n in mask.shape)
     blocks = mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
@@ -55,7 +55,7 @@ def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
 
 
 def small_silhouette(silhouette: Silhouette, width: int = MAX_WIDTH) -> Silhouette:
-    """Reduce a silhouette to at most this `width` [px]."""
+    """Return a silhouette that is reduced to at most this `width` [px]."""
     mask, scale = shrink_mask(silhouette.mask, width)
     valid = None if silhouette.valid is None else shrink_mask(silhouette.valid, width)[0]
     frame = None if silhouette.frame is None else silhouette.frame / scale
@@ -63,21 +63,22 @@ def small_silhouette(silhouette: Silhouette, width: int = MAX_WIDTH) -> Silhouet
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """Choose at most `most` indices, evenly spaced in 0 … count − 1."""
+    """Return at most `most` indices, evenly spaced in 0 … count − 1."""
     number = min(most, count)
     return [k * count // number for k in range(number)]
 
 
 def subsample(silhouettes: Sequence[Silhouette], most: int, width: int) -> list[Silhouette]:
-    """Choose at most `most` silhouettes, evenly spaced, and reduce each to at most `width` [px]."""
+    """Choose at most `most` silhouettes, evenly spaced. Returns them, each reduced to at most `width` [px]."""
     return [small_silhouette(silhouettes[k], width) for k in evenly_spaced(len(silhouettes), most)]
 
 
 class Hull:
-    """The visual hull of silhouettes. Raises InputError, which begins with `what`, if a silhouette is empty.
+    """The visual hull of silhouettes. Raises InputError if a silhouette is empty.
 
-    `center` (3,) and `reach` are the centre and the radius of a ball that contains it [scene units]. A point of the
-    hull may be outside a share `outliers` of the silhouettes, so that a few wrong masks do no harm.
+    `center` (3,) and `reach` are the centre and the radius of a ball that contains the hull [scene units]. `outliers`:
+    a point of the hull may be outside this share of the silhouettes. A few wrong masks then do no harm. Messages about
+    the cameras begin with `what`.
     """
 
     def __init__(self, silhouettes: Sequence[Silhouette], what: str, outliers: float = 0.02) -> None:
@@ -92,17 +93,18 @@ class Hull:
 
     @staticmethod
     def rays(silhouette: Silhouette) -> np.ndarray:
-        """Unit directions (n, 3) of the rays through the pixels of a mask."""
+        """Return the directions (n, 3), of length 1, of the rays through the pixels of a mask."""
         rows, columns = np.nonzero(silhouette.mask > 127)
         if not len(rows):
             raise InputError(f"{silhouette.name}: mask: is empty, or nearly: no pixels above 127")
         return silhouette.camera.directions(np.stack([columns, rows], 1) + 0.5)
 
     def depth(self, points: Tensor) -> Tensor:
-        """Approximate signed distance of points (N, 3) from the hull's surface [scene units]; positive inside.
+        """Return the approximate signed distance (N,) of points (N, 3) from the hull's surface, positive inside.
 
-        It is the smallest distance from the outline over all silhouettes except outliers, at the depth of the point.
-        Photographs that do not show the point do not count. A point that few photographs show is outside.
+        It is in scene units. For each silhouette, it takes the distance from the outline at the depth of the point. The
+        result is the smallest of these, without the outliers. A photograph that does not show the point does not count.
+        A point that few photographs show is outside.
         """
         worst = math.floor(self.outliers * len(self.silhouettes)) + 1
         lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))
@@ -134,10 +136,11 @@ class Hull:
     def shortfall(
         self, of: Sequence[Silhouette] | None = None, pixels: int = 100, samples: int = 64, outline: bool = False
     ) -> np.ndarray:
-        """How far silhouettes reach beyond the projected hull: (N, pixels) [px]. Default: the hull's own silhouettes.
+        """Return how far silhouettes reach beyond the projected hull: (N, pixels) [px].
 
-        For `pixels` random pixels of each mask, or of its `outline`: the distance of the hull from the ray through the
-        pixel, sampled at `samples` points.
+        For `pixels` random pixels of each mask, it is the distance of the hull from the ray through the pixel. The ray
+        is sampled at `samples` points. `of`: the N silhouettes; default: those of the hull. `outline`: draw the pixels
+        only from the outline of the mask.
         """
         random, result = np.random.default_rng(0), []
         along = torch.linspace(-self.reach, self.reach, samples)[:, None]
@@ -156,17 +159,17 @@ class Hull:
         return np.array(result)
 
     def grid(self, low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[Tensor, tuple[int, ...]]:
-        """The points (N, 3) of a grid between two corners (3,), and its shape."""
+        """Return the points (N, 3) of a grid between the corners `low` (3,) and `high` (3,), and the grid's shape."""
         axes = [torch.as_tensor(np.arange(a, b + spacing, spacing), dtype=torch.float32) for a, b in zip(low, high)]
         return torch.cartesian_prod(*axes), tuple(map(len, axes))
 
     def require(self, inside: int) -> None:
-        """Raise NoHull if no point was found inside."""
+        """Raise NoHull if `inside`, the number of points found inside, is 0."""
         if not inside:
             raise NoHull(f"{self.what}: mask: no point in space is inside all masks; check to_world, fx, fy, cx, cy")
 
     def ball(self, resolution: int = 48) -> tuple[np.ndarray, float]:
-        """The hull's centre of mass (3,) and the radius of the ball of equal volume [scene units]."""
+        """Return the hull's centre of mass (3,), and the radius of the ball of equal volume [scene units]."""
         spacing = 2 * self.reach / (resolution - 1)
         points, _ = self.grid(self.center - self.reach, self.center + self.reach, spacing)
         inside = points[self.depth(points) > 0].double()
@@ -174,7 +177,10 @@ class Hull:
         return inside.mean(0).numpy(), (3 * len(inside) * spacing**3 / (4 * math.pi)) ** (1 / 3)
 
     def surface(self, resolution: int = 128) -> trimesh.Trimesh:
-        """The closed surface of the largest piece [scene units], by marching cubes with `resolution` cells a side."""
+        """Return the closed surface of the hull's largest piece [scene units]. It is found by marching cubes.
+
+        `resolution`: number of cells along the longest side.
+        """
         low, high = self.center - self.reach, self.center + self.reach
         spacing = 2 * self.reach / 64
         points, shape = self.grid(low, high, spacing)
@@ -197,7 +203,7 @@ class Hull:
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:
-    """The distance of each pixel's centre from the outline of a mask (H, W) [px]; positive inside."""
+    """Return the distance (H, W) [px] of each pixel's centre from the outline of a mask (H, W), positive inside."""
     inside = mask > 127
     edge = scipy.ndimage.distance_transform_edt
     return np.where(inside, edge(inside) - 0.5, 0.5 - edge(~inside)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Meshes from files."""
+"""Reads meshes from files."""
 
 import io
 import re
@@ -14,7 +14,10 @@ JSON = 2**24  #: bytes at the beginning of a glTF file in which its extensions a
 
 
 def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
-    """Read a mesh from a file and close its seams. Raises InputError, which names the `field`, if that fails."""
+    """Read a mesh from a file, and close its seams by joining equal vertices.
+
+    Raises InputError if this fails. The message names the `field`.
+    """
     require_file(path, "the file of a mesh", field)
     with reading(f"{path}: {field}", "a mesh"):
         data = path.read_bytes()
@@ -31,7 +34,10 @@ def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
 
 
 def load_closed_mesh(path: Path, field: str) -> trimesh.Trimesh:
-    """Read a closed mesh from a file. Raises InputError, which names the `field`, if the mesh is not closed."""
+    """Read a closed mesh from a file.
+
+    Raises InputError if this fails or if the mesh is not closed. The message names the `field`.
+    """
     mesh = read_mesh(path, field)
     if not (mesh.is_watertight and mesh.is_winding_consistent):
         raise InputError(f"{path}: {field}: is not a closed surface")
@@ -39,5 +45,5 @@ def load_closed_mesh(path: Path, field: str) -> trimesh.Trimesh:
 
 
 def genus(mesh: trimesh.Trimesh) -> int:
-    """The number of handles of a closed surface, summed over its pieces."""
+    """Return the number of handles of a closed surface, summed over its pieces."""
     return mesh.body_count - mesh.euler_number // 2

@@ -5,9 +5,10 @@ from torch import Tensor
 
 
 def quarter_turns(places: Tensor, near: float) -> Tensor:
-    """Rotations (P, 3, 3) by multiples of 90° about the optical axis that map the first of `places` (P, 3) to each.
+    """Return rotations (P, 3, 3) by multiples of 90° about the optical axis.
 
-    They are the identity for places closer than `near` to the first.
+    Each moves the first of `places` (P, 3) as near as possible to one of `places`. For a place that is closer than
+    `near` to the first, it is the identity.
     """
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(places)
     turns = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])
@@ -16,7 +17,7 @@ def quarter_turns(places: Tensor, near: float) -> Tensor:
 
 
 def rotations(vectors: Tensor) -> Tensor:
-    """Rotation matrices (P, 3, 3) from rotation vectors (P, 3) [rad]; differentiable."""
+    """Convert rotation vectors (P, 3) [rad] to rotation matrices (P, 3, 3). It is differentiable."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3))

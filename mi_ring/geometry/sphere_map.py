@@ -1,4 +1,4 @@
-"""A map between a domain and the unit sphere. It gives corresponding points of different domains."""
+"""A map between a domain and the unit sphere. With it, points of different domains correspond to each other."""
 
 import numpy as np
 import trimesh
@@ -16,7 +16,7 @@ STEPS, STEP = 40, 0.1  #: number and length of the steps of the curvature flow, 
 class SphericalMap:
     """A conformal one-to-one map between a domain and the unit sphere, with as little rotation as possible.
 
-    Raises InputError, which begins with `name`, if the domain has handles or several pieces.
+    Raises InputError if the domain has handles or several pieces. The message begins with `name`.
     """
 
     def __init__(self, domain: Domain, name: str = "domain") -> None:
@@ -36,21 +36,22 @@ class SphericalMap:
         self.directions = turn.apply(self.directions)
 
     def to_sphere(self, points: np.ndarray) -> np.ndarray:
-        """The points (N, 3) of the sphere that correspond to points (N, 3) of the domain."""
+        """Return the points (N, 3) of the sphere that correspond to `points` (N, 3) of the domain."""
         if self.identity:
             return points
         return normalized(transfer_points(points, self.points, self.faces, self.directions))
 
     def to_domain(self, directions: np.ndarray) -> np.ndarray:
-        """The points (N, 3) of the domain that correspond to points (N, 3) of the sphere."""
+        """Return the points (N, 3) of the domain that correspond to points (N, 3) of the sphere."""
         return directions if self.identity else transfer_points(directions, self.directions, self.faces, self.points)
 
 
 def sphere_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The vertices (V, 3) of a closed surface without handles, mapped conformally to the unit sphere.
+    """Map the vertices (V, 3) of a closed surface without handles conformally to the unit sphere. Returns (V, 3).
 
-    The method is "Can Mean-Curvature Flow Be Made Non-Singular?" (Kazhdan, Solomon and Ben-Chen, SGP 2012): mean
-    curvature flow with the Laplacian of the first surface in all steps. It pinches off no limb and ends on a sphere.
+    The method is "Can Mean-Curvature Flow Be Made Non-Singular?" (Kazhdan, Solomon and Ben-Chen, SGP 2012). It is mean
+    curvature flow with the Laplacian of the first surface in all steps. It pinches off no limb, and it ends on a
+    sphere.
     """
     laplacian = gpytoolbox.cotangent_laplacian(points, faces)
     x = points
