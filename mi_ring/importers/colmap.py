@@ -46,7 +46,8 @@ class Colmap(Photogrammetry):
 
     @staticmethod
     def model(src: Path) -> Path | None:
-        """Find a COLMAP model: in `src`, else in sparse, sparse/*, colmap/sparse/* or * below `src`.
+        """Find a COLMAP model: in `src`, else in the folder sparse, else in a folder inside sparse, colmap/sparse or
+        `src`.
 
         Returns the folder of the model, or None if there is no model. The first of these places that has a model is
         used. If it has several, the one with the most photographs is used.

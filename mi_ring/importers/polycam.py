@@ -35,7 +35,7 @@ class Polycam(Photogrammetry):
 
     @property
     def corrected(self) -> str:
-        """Prefix of the folder names: "corrected_" if the export has corrected cameras, otherwise ""."""
+        """Prefix of the folder names: `corrected_` if the export has corrected cameras, otherwise empty."""
         return "corrected_" if (self.keyframes / "corrected_cameras").is_dir() else ""
 
     @property
