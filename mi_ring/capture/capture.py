@@ -257,7 +257,7 @@ class Capture:
 
     @property
     def up(self) -> np.ndarray:
-        """Mean up direction (3,) of the cameras, of length 1. If they cancel out, that of the first camera."""
+        """Mean up direction (3,) of the cameras, of length 1. If the mean is near 0: that of the first camera."""
         ups = np.stack([shot.camera.up for shot in self.shots])
         up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
         return up / np.linalg.norm(up)

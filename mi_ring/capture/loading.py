@@ -35,12 +35,13 @@ def load_capture(
 ) -> Capture:
     """Read a scene file with photographs. Raises InputError for anything that cannot be fitted.
 
-    `images`: False: read only cameras and lights, which is enough for rendering. `width`: reduce photographs to at most
-    this width [px]; see `reduced`. None: keep their size. `crop`: together with `width`, crop photographs to the
-    object.
+    If `images` is False, only cameras and lights are read. This is enough for rendering. `width`: reduce photographs to
+    at most this width [px]; see `reduced`. By default, they keep their size. If `width` and `crop` are given, the
+    photographs are also cropped to the object.
 
-    `masks`: "given": use the masks of the scene. "auto": the same, but if the scene has none and the room was dark,
-    make masks by brightness. "none": ignore the scene's masks, and make masks by brightness if the room was dark.
+    `masks` is one of "given", "auto" and "none". "given" uses the masks of the scene. "auto" does the same, but if the
+    scene has none and the room was dark, masks are made by brightness. "none" ignores the scene's masks. If the room
+    was dark, masks are made by brightness.
     """
     path = Path(path)
     if masks not in ("given", "auto", "none"):

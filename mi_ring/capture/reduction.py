@@ -42,9 +42,9 @@ MORE = np.array([[-1], [1]])  #: bounds found in a reduced mask are widened by o
 def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, crop: bool = True) -> Capture:
     """Return a capture with photographs of at most `width` [px], cropped to the object where this saves enough pixels.
 
-    `by_brightness`: first make masks as `with_masks_by_brightness` does. `crop`: False: only reduce. Small photographs
-    are not changed. If the capture was reduced before, nothing is changed, whatever its width. Raises InputError like
-    `load_capture`.
+    If `crop` is False, nothing is cropped. If `by_brightness` is set, masks are first made as by
+    `with_masks_by_brightness`. Small photographs are not changed. If the capture was reduced before, nothing is
+    changed, whatever its width. Raises InputError like `load_capture`.
     """
     small = all(shot.size[0] <= SMALL and reduction_factor(shot.size, width) == 1 for shot in capture.shots)
     if any(shot.window for shot in capture.shots) or not capture.images or small:

@@ -164,12 +164,12 @@ def recalibrated_xml(
     scene: bytes, shots: Sequence[Shot], room: np.ndarray | None = None, frames: Collection[str] | None = None,
     lamps: Iterable[Light] | None = None,
 ) -> bytes:  # fmt: skip
-    """Return the content of a scene file with the cameras, lights and responses of `shots`.
+    """Return new content for a scene file, with the cameras, lights and responses of `shots`. No file is written.
 
-    A shot belongs to the photograph with its name as id. If there is none, it belongs to the photograph at the same
-    position. `room` (BASIS, 3): room light; None: the scene gets none. `frames`: axes ("world", "camera") for which
-    room light is written even if it is black; default: the axes of the rooms in the file. `lamps`: point and
-    directional lights for all photographs; None: keep those of the file.
+    `scene`: old content. A shot belongs to the photograph with its name as id. If there is none, it belongs to the
+    photograph at the same position. `room` (BASIS, 3): room light; None: the scene gets none. `frames`: axes ("world",
+    "camera") for which room light is written even if it is black; default: the axes of the rooms in the file. `lamps`:
+    point and directional lights for all photographs; None: keep those of the file.
     """
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
@@ -195,7 +195,7 @@ def recalibrated_xml(
 
 
 def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
-    """Return the content of a scene file in which `shots` replace the photographs."""
+    """Return new content for a scene file, in which `shots` replace the photographs. `scene`: old content."""
     root = ElementTree.fromstring(scene)
     for element in root.findall("sensor[@type='photograph']"):
         root.remove(element)
@@ -204,7 +204,7 @@ def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
 
 
 def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) -> bytes:
-    """Return the content of a scene file with new masks. `shots`: its photographs.
+    """Return new content for a scene file, with new masks. `scene`: old content. `shots`: its photographs.
 
     `masks`: a dict from the index of a photograph to its mask file, relative to the scene file.
     """
@@ -273,10 +273,10 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
 
 
 def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
-    """Return the content of the scene file `path` for the results folder `folder`, with the fitted object.
+    """Return content for a scene file in the results folder `folder`: the scene in `path`, with the fitted object.
 
-    `subdivisions`: level of its mesh. `bsdf`: XML of its BSDF. File names become relative to `folder`. Raises
-    InputError if the scene or the `shapenet` cannot be rewritten or fitted.
+    `subdivisions`: level of the object's mesh. `bsdf`: XML of the object's BSDF. File names become relative to
+    `folder`. Raises InputError if the scene or the `shapenet` cannot be rewritten or fitted.
     """
     root = ElementTree.parse(path).getroot()
     old_bsdf, _ = bsdf_element(root, path)

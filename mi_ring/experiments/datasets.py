@@ -177,7 +177,7 @@ class Derived(CachedDataset):
     def changed(self, root: ElementTree.Element) -> bytes:
         """Return the content of the dataset's scene file.
 
-        `root`: XML of the source's scene file, in which file names are already adjusted. It may be changed.
+        `root`: XML of the source's scene file, in which file names are already adjusted. This method may change `root`.
         """
         raise NotImplementedError
 

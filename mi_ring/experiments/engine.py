@@ -60,7 +60,7 @@ def run_experiment(
 def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True) -> Outcome:
     """Fit and measure a run. If an error occurs, returns an outcome that says why the run failed.
 
-    `wanted`: False: do not fit, only measure an existing fit.
+    If `wanted` is False, nothing is fitted, and only an existing fit is measured.
     """
     try:
         if wanted:

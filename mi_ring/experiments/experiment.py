@@ -111,7 +111,7 @@ class Experiment:
     one_seed: bool = False  #: whether only one seed is allowed, because its rows have no mean
 
     def runs(self, options: ExperimentOptions) -> list[Run]:
-        """Return all runs, one for each seed.
+        """Return all runs. Each run is repeated with each seed.
 
         Raises InputError if DATA or --materials are wrong, or if two runs would have the same name.
         """

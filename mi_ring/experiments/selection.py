@@ -24,8 +24,8 @@ def datasets(options: ExperimentOptions) -> list[Dataset]:
     """Return a dataset for each capture and each mesh in DATA. Without DATA, return the default dataset.
 
     Nothing is rendered yet: `prepare` of the dataset path traces a mesh. The first mesh gets the first of --materials,
-    the second mesh the second, and so on. If there are fewer materials than meshes, they start again from the first.
-    Raises InputError if DATA or --materials are wrong.
+    the second mesh the second, and so on. If there are fewer materials than meshes, the next mesh gets the first
+    material again. Raises InputError if DATA or --materials are wrong.
     """
     meshes = [path for path in options.data if path.suffix.lower() in MESHES]
     if options.materials and not meshes:
@@ -51,7 +51,7 @@ def path_traced(
 ) -> Synthetic:
     """Return a dataset of path-traced photographs of a mesh, as in the paper. Nothing is rendered yet.
 
-    `mesh`: None: the pot of `mi-ring example`. `more`: other options of `mi-ring synthesize`.
+    If `mesh` is None, it is the pot of `mi-ring example`. `more`: other options of `mi-ring synthesize`.
     """
     settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[options.size], **more}
     config = SynthesizeConfig(Path(), Path(), material, **settings)
@@ -85,7 +85,7 @@ def one_mesh(options: ExperimentOptions) -> Path | None:
 
 
 def short_name(material: str) -> str:
-    """Return a short name of a material for file names. It has the plugin or the file, and the roughness."""
+    """Return a short name of a material for file names. It consists of the plugin or the file, and the roughness."""
     if ".npz:" in material:
         return material.rpartition(":")[2]
     words = material.split()

@@ -46,11 +46,10 @@ class Colmap(Photogrammetry):
 
     @staticmethod
     def model(src: Path) -> Path | None:
-        """Find a COLMAP model: in `src`, else in the folder sparse, else in a folder inside sparse, colmap/sparse or
-        `src`.
+        """Find a COLMAP model in the folder `src`. Returns the folder of the model, or None if there is no model.
 
-        Returns the folder of the model, or None if there is no model. The first of these places that has a model is
-        used. If it has several, the one with the most photographs is used.
+        The model is in `src` itself, in its folder sparse, or in a folder inside sparse, colmap/sparse or `src`. The
+        first of these places that has a model is used. If it has several, the one with the most photographs is used.
         """
         inside = ((src / inner).glob("*") for inner in ("sparse", "colmap/sparse", "."))
         for places in ([src], [src / "sparse"], *inside):
@@ -131,7 +130,8 @@ def count_images(folder: Path) -> int:
 def require_points(folder: Path) -> None:
     """Raise InputError if a camera in images.txt has no line of 2-D points after it. This line may be empty.
 
-    Without this line, COLMAP would read the next camera as points, and that camera would be lost. Binary models pass.
+    Without this line, COLMAP would read the next camera as points, and that camera would be lost. Binary models are not
+    checked.
     """
     if (folder / "images.bin").is_file():
         return

@@ -71,9 +71,9 @@ def require_most(source: Source, frames: Sequence[Frame]) -> None:
 
 
 def unread(source: Source) -> str:
-    """Return a clause for an error message: which file formats of the missing photographs are not supported.
+    """Return a clause for an error message. It names file formats of missing photographs that mi_ring cannot read.
 
-    It looks in `source.folder` for files with the names of missing photographs. Returns "" if it finds none.
+    The function looks in `source.folder` for files with the names of missing photographs. Returns "" if there are none.
     """
     stems = {stem_of(parts_of(name)[-1]) for name in source.without_photograph if parts_of(name)}
     found = (file for file in source.folder.rglob("[!.]*") if stem_of(file.name.lower()) in stems)

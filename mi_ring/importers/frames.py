@@ -124,7 +124,7 @@ def frames_of(source: Source) -> list[Frame]:
 
 
 def is_scaled(size: Sequence[int], original: Sequence[int]) -> bool:
-    """Return whether an image of size `original` becomes one of `size` if it is resized with equal proportions.
+    """Return whether an image was resized from the size `original` to `size` with equal proportions.
 
     Both are (width, height) [px]. Returns False if the sizes differ by less than 5 %.
     """
@@ -133,11 +133,11 @@ def is_scaled(size: Sequence[int], original: Sequence[int]) -> bool:
 
 
 def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
-    """Fit a frame's lens to its image file. `size` (width, height) [px]: of the file. `orientation`: by EXIF.
+    """Change a frame's lens so that it fits the image file. `size` (width, height) [px]: size of the file.
 
-    If the photograph was resized, the lens is scaled. If the lens is that of the upright photograph,
-    `frame.orientation` is set. Returns a clause that tells the user what was changed; empty if nothing was. If the
-    proportions of lens and file differ, nothing is changed.
+    If the photograph was resized, the lens is scaled. If the lens is that of the photograph turned upright by its EXIF
+    `orientation`, `frame.orientation` is set. Returns a clause that tells the user what was changed; empty if nothing
+    was. If the proportions of lens and file differ, nothing is changed.
     """
     done = ""
     if size != frame.lens.size and orientation > 4 and (

@@ -18,8 +18,8 @@ from mi_ring.importers.reading import existing, image_size, list_images, matrix
 class Llff(Photogrammetry):
     """LLFF, NeRF: poses_bounds.npy beside folders images, images_4, … The light is fixed to the camera.
 
-    SRC is the folder of poses_bounds.npy. The photographs are in images. If this is empty, they are in images_4 or the
-    like. Their order by name must be the order of the poses.
+    SRC is the folder of poses_bounds.npy. The photographs are in its folder images. If this has none, they are in
+    images_4 or the like. The order of the photographs by name must be the order of the poses.
     """
 
     fields = Fields(

@@ -123,7 +123,7 @@ class NamedPhotographs(Source):
 
         With the option `masks`, they come from this folder. Raises InputError if a photograph has no mask there.
         Without the option, they come from the alpha channels of the photographs, and then from a folder named masks
-        near the photographs. Then a photograph may have no mask.
+        near the photographs. In this case, a photograph may have no mask.
         """
         folder, root = self.masks, self.photograph_files.root
         if folder is not None and not folder.is_dir():

@@ -69,8 +69,8 @@ def exif_values(path: Path) -> dict[int, Any]:
 def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
     """Return the exposure of each photograph: exposure time · ISO / aperture². It is NaN if it is unknown.
 
-    `photographs`: for each, a dict from EXIF tags to values. If no photograph has one of the three, for example the
-    aperture of an old lens, this one is taken as 1 for all.
+    `photographs`: for each, a dict from EXIF tags to values. A value that all photographs lack, for example the
+    aperture of an old lens, is taken as 1.
     """
     values = np.array([[positive(exif.get(tag)) for tag in EXPOSURE] for exif in photographs]).reshape(-1, 3)
     unknown = np.isnan(values).all(0)

@@ -99,8 +99,8 @@ def refuse_twins(
 ) -> set[str]:
     """Decide which path gets a file that several paths claim. Returns the set of paths that get no file.
 
-    `claims`: tuples (file, path, whether the folders of both match). A path with matching folders gets the file. Raises
-    InputError if this leaves more than one path. The message contains `what`, which says what the file would be, and
+    `claims`: tuples (file, path, whether the folders of both match). The path whose folders match gets the file. Raises
+    InputError if this is not exactly one path. The message contains `what`, which says what the file would be, and
     `advice`.
     """
     by_file: dict[Path, list[tuple[str, bool]]] = defaultdict(list)

@@ -248,7 +248,7 @@ def match_pairs(
 
 
 def match_again(files: Collection[str], folder: Path, progress: Progress) -> bool:
-    """Match pairs again by guided matching: those that have matches and one of these files.
+    """Match some pairs again by guided matching: pairs that have matches and contain one of these files.
 
     Guided matching searches only along the epipolar lines. It finds more matches, but also more wrong ones. Returns
     whether there was such a pair.

@@ -87,7 +87,7 @@ def write_file(path: Path, content: bytes | memoryview | str, durable: bool = Fa
 
 
 def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
-    """Write a dictionary by `torch.save`, with a checksum. By it, `read_state` detects damage.
+    """Write a dictionary by `torch.save`, with a checksum. `read_state` detects damage by this checksum.
 
     `keep`: see `write_file`.
     """
