@@ -188,7 +188,7 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
 def room_of(room: ArrayLike) -> np.ndarray:
     """Return the spherical harmonics (n, 3) of a room's light as an array (BASIS, 3). Missing rows are 0.
 
-    Raises InputError if n is not the number of harmonics up to an order.
+    Raises InputError if n is not (order + 1)² for an order up to `MAX_ORDER`.
     """
     array, counts = np.asarray(room, float), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
     if array.ndim != 2 or array.shape[0] not in counts:

@@ -207,7 +207,7 @@ class Capture:
     def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
         """Return cameras and lights of the photographs `index` for the renderer. The photographs must be of one size.
 
-        They are at 1 / `scale` of this size.
+        They will be rendered at 1 / `scale` of this size.
         """
         return self.photographs.select(index, self.shots[index[0]].size, scale)
 
@@ -306,7 +306,7 @@ class Capture:
         return self.threshold is None or (self.photographs.colocated and not self.photographs.dark)
 
     def outline(self, k: int) -> str:
-        """Return the name of the file that contains the mask of photograph `k`. It is for messages."""
+        """Return the name of the file that contains the mask of photograph `k`. The name is for messages."""
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:

@@ -52,7 +52,7 @@ def decode(
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
     """Return the factors of vignetting and gain for each pixel, (H, W, 3), at 1 / `scale` of the photograph's size.
 
-    Without vignetting, it is the gain alone, (3,). If the gain is 1 too, it is the number 1.
+    Without vignetting, returns the gain alone, (3,). If the gain is 1 too, returns the number 1.
     """
     gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
     if not shot.response.vignetting:

@@ -23,8 +23,8 @@ def grabcut(rgb: np.ndarray, coverage: np.ndarray, background: np.ndarray, band:
     """Segment the object in a photograph (H, W, 3) uint8 sRGB. Returns a mask (H, W) uint8, 1 on the object.
 
     `coverage` (H, W) uint8, 0 or 1: approximate mask. `background` (H, W) bool: pixels that certainly do not show the
-    object. GrabCut decides only about a band along the outline of `coverage`. It reaches `band` · s inside the outline
-    and 1.5 `band` · s outside, where s is the square root of the mask's area [px].
+    object. GrabCut decides only about a band along the outline of `coverage`. The band reaches `band` · s inside the
+    outline and 1.5 `band` · s outside, where s is the square root of the mask's area [px].
     """
     seed = np.full(coverage.shape, cv2.GC_BGD, np.uint8)
     seed[dilate_by_share(coverage, 1.5 * band) > 0] = cv2.GC_PR_BGD

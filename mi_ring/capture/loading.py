@@ -39,9 +39,9 @@ def load_capture(
     at most this width [px]; see `reduced`. By default, they keep their size. If `width` and `crop` are given, the
     photographs are also cropped to the object.
 
-    `masks` is one of "given", "auto" and "none". "given" uses the masks of the scene. "auto" does the same, but if the
-    scene has none and the room was dark, masks are made by brightness. "none" ignores the scene's masks. If the room
-    was dark, masks are made by brightness.
+    `masks` is one of "given", "auto" and "none". "given" uses the masks of the scene. "auto" does the same. But if the
+    scene has none, it makes masks by brightness. "none" ignores the masks of the scene, and makes masks by brightness.
+    Masks by brightness need a dark room. If the room was lit, there are no masks then.
     """
     path = Path(path)
     if masks not in ("given", "auto", "none"):

@@ -27,8 +27,8 @@ class Observation(NamedTuple):
     def surely(self, coverage: Tensor) -> Tensor:
         """Return which pixels show only the object, (n, H, W) bool.
 
-        `coverage` (n, H, W): the object's share of each pixel. It must be above 0.99. If the photograph has a mask, the
-        mask must be above 0.99, too.
+        `coverage` (n, H, W): the object's share of each pixel. At the returned pixels, it is above 0.99. If the
+        photograph has a mask, the mask is above 0.99 there, too.
         """
         mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
         return torch.minimum(mask, coverage) > 0.99
@@ -77,7 +77,7 @@ def observed(
 class ObservationCache:
     """Cache of the observations of single photographs, with up to `REMEMBERED_PIXELS` pixels in total.
 
-    For each photograph, it keeps the observation of the scale that was used last. It keeps none of scale 1.
+    For each photograph, it keeps the observation of the scale that was used last. Observations of scale 1 are not kept.
     """
 
     def __init__(self) -> None:

@@ -69,9 +69,9 @@ def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, c
 
 
 def reduction_factor(size: tuple[int, ...], width: int) -> float:
-    """Return the factor by which an image must shrink to be at most `width` [px] wide. It is at least 1.
+    """Return the factor, at least 1, by which an image must shrink to be at most `width` [px] wide.
 
-    `size`: (width, height) [px] of the image. The height may be at most `HIGHEST` · `width`.
+    `size`: (width, height) [px] of the image. The height of the reduced image is at most `HIGHEST` · `width`.
     """
     return max(1.0, size[0] / width, size[1] / (HIGHEST * width))
 
@@ -79,7 +79,7 @@ def reduction_factor(size: tuple[int, ...], width: int) -> float:
 def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], width: int) -> Window:
     """Return the window with the upper left corner `low` (2,) and the size `extent` (2,) [px of the photograph].
 
-    It is reduced to at most `width` [px]. `whole`: (width, height) [px] of the photograph.
+    The window is reduced to at most `width` [px]. `whole`: (width, height) [px] of the photograph.
     """
     scale = reduction_factor(tuple(extent), width)
     blocks = int(scale)  # the first step of the reduction averages squares of so many pixels
@@ -263,9 +263,9 @@ def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
 
 
 def source(read: Reader | None) -> tuple | None:
-    """Return a tuple that identifies what a reader of `mi_ring.capture.decoding` reads, by digests of the files.
+    """Return a tuple that identifies what a reader of `mi_ring.capture.decoding` reads. It has digests of the files.
 
-    Returns None for any other reader.
+    If two readers have equal tuples, they read equal arrays. Returns None for any other reader.
     """
     if not isinstance(read, partial) or read.func not in (read_photograph, read_mask):
         return None
@@ -275,7 +275,7 @@ def source(read: Reader | None) -> tuple | None:
 
 
 def key_of(*parts: Any) -> str:
-    """Return the key in the cache for a result that is computed from `parts`. It is a hash of them."""
+    """Return the key in the cache for a result that is computed from `parts`. The key is a hash of `parts`."""
     return hashlib.blake2b(repr((FORMAT, *parts)).encode(), digest_size=16).hexdigest()
 
 

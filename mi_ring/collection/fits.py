@@ -81,7 +81,7 @@ def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = No
 def die_with_parent() -> dict[str, Any]:
     """Return options of `Popen` with which the kernel kills the child process when this process ends.
 
-    Returns none on other systems than Linux.
+    Only Linux has this. On other systems, the options are empty.
     """
     if not sys.platform.startswith("linux"):
         return {}

@@ -199,7 +199,7 @@ class Subset(Derived):
 
 @dataclass(frozen=True)
 class PerturbedCameras(Derived):
-    """A capture with wrong cameras; see `miscalibrated`. It does not say that the cameras are exact."""
+    """A capture with wrong cameras; see `miscalibrated`. Its scene file does not say that the cameras are exact."""
 
     degrees: float  #: standard deviation of rotations [deg] and of positions [% of the distance]
     seed: int

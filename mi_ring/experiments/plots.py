@@ -33,7 +33,7 @@ def title_of(outcome: Outcome, but: str = "") -> str:
 
 
 def of_finished(plot: Plot) -> Plot:
-    """Decorate a plot. It then gets only the finished runs. A line below the figure names the failed runs."""
+    """Decorate a plot. The plot then gets only the finished runs. A line below the figure names the failed runs."""
 
     @functools.wraps(plot)
     def annotated(outcomes: list[Outcome]) -> Figure:

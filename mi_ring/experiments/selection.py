@@ -63,7 +63,7 @@ def path_traced(
 
 
 def require_no_materials(options: ExperimentOptions) -> None:
-    """Raise InputError if --materials is given. It is for experiments that do not use materials."""
+    """Raise InputError if --materials is given. Experiments that do not use materials call this function."""
     if options.materials:
         raise InputError("--materials: apply to meshes, which this experiment does not use; leave them out")
 

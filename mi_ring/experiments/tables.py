@@ -72,7 +72,7 @@ def csv_text(names: Mapping[str, str], rows: Sequence[Row]) -> str:
 
 
 def markdown(experiment: Experiment, names: Mapping[str, str], rows: Sequence[Row], command_line: str) -> str:
-    """Return the table as Markdown. Its subject is above it. Command line, computer and date are below it."""
+    """Return the table as Markdown. Above the table is its subject. Below it are command line, computer and date."""
 
     def cell(name: str, value: Any) -> str:
         if isinstance(value, float) and name in experiment.columns:

@@ -26,7 +26,7 @@ def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.n
 
 
 def undistortion_factor(distortion: Any, distance2: Any) -> Any:
-    """Return the factor that removes lens distortion. It multiplies the vector from the picture's centre to a point.
+    """Return the factor that removes distortion: multiply the vector from the picture's centre to a point by it.
 
     `distance2`: squared length of the distorted vector [focal lengths²]. The factor s solves s (1 + `distortion` s²
     `distance2`) = 1. Newton's method finds it, if `distortion` · `distance2` is between `MIN_DISTORTION` and
@@ -40,11 +40,10 @@ def undistortion_factor(distortion: Any, distance2: Any) -> Any:
 
 
 def distortion_factor(distortion: Any, distance2: Any) -> tuple[Any, Any]:
-    """Return the factor of lens distortion, and whether the point is visible.
+    """Return (factor, visible) for a point. Distortion multiplies the vector from the picture's centre by the factor.
 
-    The factor multiplies the vector from the picture's centre to the point. `distance2`: squared length of the
-    undistorted vector [focal lengths²]. A point is not visible if it is beyond the distance at which the lens folds.
-    Arguments are arrays of numpy, torch or Dr.Jit.
+    `distance2`: squared length of the undistorted vector [focal lengths²]. A point is not visible if it is beyond the
+    distance at which the lens folds. Arguments are arrays of numpy, torch or Dr.Jit.
     """
     k = distortion * distance2
     return 1 + k, 1 + 3 * k > 0

@@ -34,7 +34,9 @@ class Silhouette(NamedTuple):
 
     @property
     def whole(self) -> "Silhouette":
-        """The silhouette of the whole photograph. Outside of this part, its mask is empty."""
+        """The silhouette of the whole photograph. If this silhouette is only a part of it, the rest of the mask is
+        empty.
+        """
         if self.frame is None:
             return self
         before = np.ceil(-self.frame[0]).astype(int)
@@ -102,9 +104,9 @@ class Hull:
     def depth(self, points: Tensor) -> Tensor:
         """Return the approximate signed distance (N,) of points (N, 3) from the hull's surface, positive inside.
 
-        It is in scene units. For each silhouette, it takes the distance from the outline at the depth of the point. The
-        result is the smallest of these, without the outliers. A photograph that does not show the point does not count.
-        A point that few photographs show is outside.
+        The distance is in scene units. For each silhouette, the distance from its outline is computed at the depth of
+        the point. The result is the smallest of these distances, without the outliers. A photograph that does not show
+        the point does not count. A point that few photographs show is outside.
         """
         worst = math.floor(self.outliers * len(self.silhouettes)) + 1
         lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))

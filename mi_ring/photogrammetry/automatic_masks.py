@@ -72,7 +72,7 @@ class VoxelObject:
 
 
 class VoxelGrid:
-    """A cube of voxels around `center` (3,), and the views that see it. Its edges have the length 2 · `half_size`."""
+    """A cube of voxels around `center` (3,), and the views that see it. The cube's edges are 2 · `half_size` long."""
 
     def __init__(self, views: Views, center: np.ndarray, half_size: float) -> None:
         self.views, self.center, self.half_size = views, center, half_size
@@ -102,10 +102,10 @@ class VoxelGrid:
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
     def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
-        """Find the object by a vote of the masks. It is the largest connected component of the voxels that are chosen.
+        """Find the object by a vote of the masks: the largest connected component of voxels that most masks contain.
 
-        Returns None if it is too small. `agreement`: share of the masks that must contain a voxel. `voters`: for each
-        mask, whether it votes; None: all vote.
+        Returns None if this component is too small. `agreement`: share of the masks that must contain a voxel.
+        `voters`: for each mask, whether it votes; None: all vote.
         """
         yes, shown = np.zeros((2, len(self.points)), np.int16)
 

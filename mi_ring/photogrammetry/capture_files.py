@@ -134,7 +134,7 @@ def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:
 
 
 def crop_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndarray:
-    """Enlarge a mask to its photograph, and crop it to a window. Its values are `OBJECT`, `UNKNOWN` and 0.
+    """Enlarge a mask to its photograph, and crop it to a window. The result has the values `OBJECT`, `UNKNOWN` and 0.
 
     `size`: (width, height) [px] of the photograph.
     """

@@ -278,9 +278,9 @@ def without_exposure(pictures: Sequence[Picture]) -> list[str]:
 
 
 def exif_exposures(pictures: Sequence[Picture]) -> np.ndarray:
-    """Return exposure time · ISO / aperture² (N,) of the photographs by EXIF data. It is NaN if it is unknown.
+    """Return the exposures (N,) of the photographs by EXIF data: exposure time · ISO / aperture². NaN if unknown.
 
-    If no photograph has one of the three values, this value is taken as 1.
+    A value that all photographs lack, for example the aperture of an old lens, is taken as 1.
     """
     return np.array(exposures_of([picture.exif.get_ifd(ExifTags.IFD.Exif) for picture in pictures]))
 

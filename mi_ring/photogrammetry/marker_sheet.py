@@ -68,7 +68,10 @@ def charuco() -> cv2.aruco.CharucoBoard:
 
 
 def page(paper: Literal["a4", "letter"]) -> Image.Image:
-    """Draw the page to print: the sheet, and below it a line that says what to measure. It has `DOTS` pixels per mm."""
+    """Draw the page to print: the sheet, and below it a line that says what to measure.
+
+    The page has `DOTS` pixels per mm. No file is written.
+    """
     size = DOTS * SQUARE * np.array([COLUMNS, ROWS])
     sheet = Image.new("1", (round(DOTS * PAPERS[paper][0]), round(DOTS * PAPERS[paper][1])), 1)
     left, top = ((np.array(sheet.size) - size) // 2).tolist()

@@ -121,8 +121,8 @@ def read_features(database: Path) -> dict[str, Features]:
 def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Find, for each descriptor (n, 128), the nearest of the `others` (m, 128). Returns (indices (n,), ratios (n,)).
 
-    A ratio is the angle to the nearest one, divided by the angle to the second nearest one. It is infinite if the
-    nearest one is too far for a match. Products of integers are exact in float32.
+    A ratio is the angle to the nearest one, divided by the angle to the second nearest one. If the angle to the nearest
+    one is too large for a match, the ratio is infinite. Products of integers are exact in float32.
     """
     others = torch.cat([others.float(), torch.zeros(1, others.shape[1])])  # the second nearest one if there is only one
     buffer, found = torch.empty(BLOCK, len(others)), []  # new memory for each block would take longer than its product
@@ -151,10 +151,10 @@ def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.nda
 
 
 def match_pair(first: Features, second: Features) -> Any:
-    """Estimate the two-view geometry of two images with COLMAP. Returns it with all matches that agree with it.
+    """Estimate the two-view geometry of two images with COLMAP. Its inliers are all matches that agree with it.
 
-    The geometry is found from the matches that pass the ratio test. Then other matches are added if they agree with it.
-    Few of these are wrong, even if their ratio is near 1, for example for two similar features on an object.
+    The geometry is found from the matches that pass the ratio test. Then other matches are added if they agree with the
+    geometry. Few of these are wrong, even if their ratio is near 1, for example for two similar features on an object.
     """
     matches, ratios = match_descriptors(first.descriptors, second.descriptors)
     geometry = pycolmap.estimate_two_view_geometry(

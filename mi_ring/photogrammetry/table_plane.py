@@ -133,9 +133,9 @@ def estimate_albedo(
 ) -> np.ndarray | None:
     """Estimate the table's diffuse albedo (texels, texels, 3). Returns None if no view shows the table.
 
-    It is the median over the views. `lights`: one per view. `hidden`: for each view, an array (H, W) above 0 where
-    something may hide the table. `flash`: gives the flash's cone, the room light and the camera's response. Texels that
-    no view shows get the median of the others. Interreflection is ignored.
+    The albedo is the median over the views. `lights`: one per view. `hidden`: for each view, an array (H, W) above 0
+    where something may hide the table. `flash`: gives the flash's cone, the room light and the camera's response.
+    Texels that no view shows get the median of the others. Interreflection is ignored.
     """
     found = np.full((len(views), grid.texels**2, 3), np.nan, np.float32)
     for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
@@ -230,8 +230,8 @@ def bare_table(
     """Return a mask (H, W) uint8 for each view: pixels that show only the table.
 
     `silhouettes`: for each view, a rough mask (H, W) of the object. `tables`: appearances of the table. Each pixel is
-    compared with the first that covers it. Darker pixels count as table in shadow. If the object then looks like the
-    table, they do not count. If it still looks like the table, returns None.
+    compared with the first that covers it. At first, darker pixels count as table in shadow. If too much of the object
+    then looks like the table, they no longer count. Returns None if the object still looks like the table.
     """
     differences = []
     for view in progress(views, "bare table"):

@@ -118,7 +118,7 @@ def name_in_help(name: str) -> str:
 
 
 def scene_name(scene: Path) -> str:
-    """Return the name of a scene. It is that of the file without suffix, or that of the folder for a file scene.xml."""
+    """Return the name of a scene: its file name without suffix. For a file scene.xml, it is the name of its folder."""
     return scene.stem if scene.stem != "scene" else scene.resolve().parent.name
 
 
@@ -147,7 +147,7 @@ def interrupted() -> bool:
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """A context manager for work that the same command can continue. If a signal of `SIGNALS` arrives, it says this.
+    """A context manager for work that the same command can continue. On a signal of `SIGNALS`, it prints this advice.
 
     It then raises Interrupted, even if a library turns the signal into another error. Only the main thread receives
     signals.

@@ -98,7 +98,7 @@ def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
 
 
 def seal(archive: io.BytesIO) -> None:
-    """Add a comment to a zip file. It contains the checksum of everything before it."""
+    """Add a comment to a zip file: the checksum of everything before the comment."""
     end = archive.seek(-COMMENT - 2, os.SEEK_END)
     assert archive.read(len(END)) == END, "it has a comment already"
     archive.seek(end + COMMENT)

@@ -8,9 +8,10 @@ OWN = "MI_RING_OWN_GPU"  #: environment variable: 1 if no other process of the s
 
 
 def choose_gpu() -> None:
-    """Hide all GPUs but one from this process, if `torchrun` started several on this machine. Its rank chooses the GPU.
+    """Let this process see only one GPU, if `torchrun` started several processes on this machine.
 
-    It does so only for the commands of mi_ring, not for other programs that import mi_ring.
+    The rank of the process chooses the GPU. This is done only for the commands of mi_ring, not for other programs that
+    import mi_ring.
     """
     if not any(word in ("mi_ring", "mi_ring.fit") or Path(word).stem == "mi-ring" for word in sys.orig_argv):
         return

@@ -35,7 +35,7 @@ def device() -> torch.device:
 def has_fast_bfloat16(device: torch.device) -> bool:
     """Return whether matrix products are faster in bfloat16 than in float32. Most processors only emulate bfloat16.
 
-    It looks at the features of the processor. It measures nothing, so that a fit can be repeated exactly.
+    The features of the processor decide this. Nothing is measured, so that a fit can be repeated exactly.
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -138,7 +138,8 @@ def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) 
 def cpu_quota(root: Path) -> float:
     """Return the number of cores that the control groups below `root` allow this process.
 
-    It is infinite if there is no limit. Parent groups limit it, too: https://docs.kernel.org/admin-guide/cgroup-v2.html
+    Without a limit, the number is infinite. Parent groups limit it, too:
+    https://docs.kernel.org/admin-guide/cgroup-v2.html
     """
     groups = [root]
     with contextlib.suppress(OSError):
@@ -225,6 +226,6 @@ def keep_memory() -> None:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system. It may be half of the memory that a fit has."""
+    """Return freed memory to the system. This may be half of the memory of a fit."""
     dr.flush_malloc_cache()
     glibc("malloc_trim")(0)
