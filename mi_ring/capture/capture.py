@@ -194,7 +194,9 @@ class Capture:
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Split the photographs `index` into groups of one size, at most `most` each. Yields the indices of a group."""
+        """Split `index` into groups of photographs of one size, at most `most` in each. Yields the indices of each
+        group.
+        """
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
@@ -236,7 +238,7 @@ class Capture:
 
     @functools.cached_property
     def lit_room(self) -> bool:
-        """True if pixels outside the masks are lit. If not, a black pixel shows that the object is not there."""
+        """True if pixels outside the masks are lit. In a dark room, black pixels show that the object is not there."""
         shares = []
         for k in self.spread(SOME):
             rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.shots[k].size) // COARSE))

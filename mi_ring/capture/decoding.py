@@ -118,7 +118,7 @@ def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
 
 
 def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Read the encoded pixels (H, W, 3) of the image file in `field` of the photograph.
+    """Read the encoded pixels (H, W, 3) of a photograph's image file. `field`: "filename" or "ambient".
 
     The grey of a grey image is repeated in R, G and B. Transparent pixels become black.
     """
@@ -145,9 +145,9 @@ def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
 
 
 def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Read the mask (H, W) uint8 from the file in `field` of the photograph.
+    """Read a mask (H, W) uint8 of a photograph. `field`: "mask" or "valid".
 
-    If this file is the photograph itself, the mask is its alpha channel. Raises InputError if there is none.
+    If its file is the photograph itself, the mask is the alpha channel. Raises InputError if there is none.
     """
     file, itself = getattr(shot.files, field), getattr(shot.files, field) == shot.files.filename
     pixels = read_pixels(file, field, shot, scene)

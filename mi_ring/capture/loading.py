@@ -105,7 +105,7 @@ def require_capture(path: Path, masks: str) -> None:
 
 
 def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
-    """Return the masks (H, W) in `field` of the photographs. Each mask is read when it is used.
+    """Return a mask (H, W) for each photograph. Each mask is read when it is used. `field`: "mask" or "valid".
 
     Photographs with the same mask file share one array.
     """
@@ -163,7 +163,7 @@ def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
 def require_xml(path: Path) -> None:
     """Raise InputError if the XML is invalid, or if a photograph or its point light has no position.
 
-    Mitsuba would put it at the origin. Raises UnicodeDecodeError if the file is not UTF-8.
+    Without a position, Mitsuba would use the origin. Raises UnicodeDecodeError if the file is not UTF-8.
     """
     content = path.read_bytes()
     content.decode("utf-8")

@@ -111,9 +111,10 @@ def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], wid
 
 
 def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
-    """Return the lowest and highest corner (2, 2) [px] of the object in each mask. None if it is missing or empty.
+    """Return the lowest and highest corner (2, 2) [px] of the object in each mask.
 
-    `large`: True if the masks are large. Then the cache folder keeps the corners.
+    If a mask is missing or empty, there is None instead. `large`: True if the masks are large. Then the cache folder
+    keeps the corners.
     """
     several = {reader: k for k, reader in enumerate(capture.masks.readers) if reader}  # some may share a mask
 

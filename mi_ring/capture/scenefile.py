@@ -91,7 +91,7 @@ def scene_element(
 def table_element(picture: str, square: np.ndarray) -> Element:
     """Make the XML of a diffuse `table`. `picture`: image file of the albedo.
 
-    `square` (4, 4): its transform `to_world`.
+    `square` (4, 4): transform `to_world` of the table.
     """
     element = ElementTree.Element("shape", type="table")
     add_pose(element, square)

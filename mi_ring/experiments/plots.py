@@ -28,7 +28,10 @@ Plot = Callable[[list[Outcome]], Figure]
 
 
 def title_of(outcome: Outcome, but: str = "") -> str:
-    """Return the labels of a run as text, without the label `but`. A number follows the name of its label."""
+    """Return the labels of a run as text, without the label `but`: for example "bunny, views 5".
+
+    A number has the name of its label before it. A word does not.
+    """
     return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items() if k != but)
 
 

@@ -34,9 +34,7 @@ class Silhouette(NamedTuple):
 
     @property
     def whole(self) -> "Silhouette":
-        """The silhouette of the whole photograph. If this silhouette is only a part of it, the rest of the mask is
-        empty.
-        """
+        """The silhouette of the whole photograph. If this silhouette is a part of it, the rest of its mask is empty."""
         if self.frame is None:
             return self
         before = np.ceil(-self.frame[0]).astype(int)
@@ -140,9 +138,9 @@ class Hull:
     ) -> np.ndarray:
         """Return how far silhouettes reach beyond the projected hull: (N, pixels) [px].
 
-        For `pixels` random pixels of each mask, it is the distance of the hull from the ray through the pixel. The ray
-        is sampled at `samples` points. `of`: the N silhouettes; default: those of the hull. `outline`: draw the pixels
-        only from the outline of the mask.
+        Each value is the distance of the hull from the ray through a random pixel of a mask. `pixels`: number of rays
+        for each mask. `samples`: number of points on a ray at which the distance is computed. `of`: the N silhouettes;
+        default: those of the hull. `outline`: take pixels only from the outline of the mask.
         """
         random, result = np.random.default_rng(0), []
         along = torch.linspace(-self.reach, self.reach, samples)[:, None]

@@ -139,7 +139,7 @@ def bright_mask(view: ReducedView) -> np.ndarray:
 
 
 def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
-    """Return for each view whether its mask is complete. `silhouettes`: of the object that all masks agree on.
+    """Return for each view whether its mask is complete. `silhouettes`: those of the object that the masks agree on.
 
     A complete mask misses about as little of its silhouette as the other masks do of theirs.
     """
@@ -161,10 +161,11 @@ class Segmentation(NamedTuple):
 def refine_masks(
     grid: VoxelGrid, guesses: Masks, backgrounds: Masks, progress: Progress, settings: RefinementSettings = LOCATION
 ) -> Segmentation | None:  # fmt: skip
-    """Refine masks: in turn, all views vote on the object, and GrabCut finds new masks around its silhouettes.
+    """Refine masks by two steps in turn: the masks of all views vote on the object, and GrabCut finds new masks.
 
-    `guesses`: for each view, an array (H, W) above 0 on the guessed object. `backgrounds`: for each view, an array (H,
-    W) above 0 where the object certainly is not. Returns None if the masks do not agree on any object.
+    GrabCut starts from the silhouettes of the object. `guesses`: for each view, an array (H, W) above 0 on the guessed
+    object. `backgrounds`: for each view, an array (H, W) above 0 where the object certainly is not. Returns None if the
+    masks do not agree on any object.
     """
 
     def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:

@@ -117,13 +117,13 @@ def calibrate_flash(
 ) -> FlashCalibration | None:  # fmt: skip
     """Calibrate the flash from the brightness of white paper. Returns None if no photograph shows the paper.
 
-    The dicts have names of photographs as keys. `papers`: samples of the paper. `poses`: (4, 4). `axes`: (3, 3), see
-    `turn_with_cameras`. `exposures`: relative, NaN if unknown. `offset` (3,): approximate position of the flash
-    relative to the camera. `sphere`: stands for the object; None: no object. `curved`: also estimate the camera's
-    response.
+    The dicts have names of photographs as keys. `papers`: samples of the paper. `poses`: camera-to-world (4, 4).
+    `axes`: (3, 3), see `turn_with_cameras`. `exposures`: relative, NaN if unknown. `offset` (3,): approximate position
+    of the flash relative to the camera. `sphere`: stands for the object; None: no object. `curved`: also estimate the
+    camera's response.
 
-    The method is robust least squares of log brightness, with the priors above. It estimates the `FlashParameters`, and
-    the intensity of each photograph. Samples in the margin are used only if they are as bright as the squares. If the
+    The method is robust least squares of log brightness, with priors. It estimates the `FlashParameters`, and the
+    intensity of each photograph. Samples in the margin are used only if they are as bright as the squares. If the
     response is nearly linear, it is set to linear.
     """
     names = [n for n in papers if n in poses and not papers[n].in_margin.all() and poses[n][2, 3] > 0]

@@ -263,9 +263,10 @@ def sample_paper(
 def sample_colours(
     photograph: np.ndarray, linear: Callable[[np.ndarray], np.ndarray], points: np.ndarray, plane: np.ndarray
 ) -> np.ndarray:
-    """Return the linear colours (n, 3) of a photograph (H, W, 3) at `points` (n, 2) of a plane; NaN outside of it.
+    """Return the linear colours (n, 3) of a photograph (H, W, 3) at `points` (n, 2) of a plane.
 
-    `plane` (3, 3): homography from the plane to pixels. `linear`: see `sample_paper`.
+    A colour is NaN if its point is outside the photograph. `plane` (3, 3): homography from the plane to pixels.
+    `linear`: see `sample_paper`.
     """
     at = cv2.perspectiveTransform(points[None], plane) - 0.5
     height, width = photograph.shape[:2]

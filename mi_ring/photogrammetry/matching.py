@@ -176,8 +176,8 @@ def verification() -> Any:
 def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the residuals (k,) [px] of k matches in a two-view geometry. `first`, `second`: their points (k, 2) [px].
 
-    For a homography, it is the distance from the mapped first point. Otherwise it is the Sampson distance from the
-    epipolar line.
+    If the geometry is a homography, a residual is the distance of the second point from the mapped first one. Otherwise
+    it is the Sampson distance from the epipolar line.
     """
     kinds = pycolmap.TwoViewGeometryConfiguration
     if geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):

@@ -94,7 +94,7 @@ def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
 def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
     """Choose a window around the object in a photograph. `mask` (h, w): the object in the whole photograph.
 
-    `pixels`: about the length that the object gets in the window [px].
+    `pixels`: approximate length of the object in the reduced window [px].
     """
     rows, columns = np.nonzero(mask)
     size = np.array(lens.size)

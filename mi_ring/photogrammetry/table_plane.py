@@ -230,8 +230,8 @@ def bare_table(
     """Return a mask (H, W) uint8 for each view: pixels that show only the table.
 
     `silhouettes`: for each view, a rough mask (H, W) of the object. `tables`: appearances of the table. Each pixel is
-    compared with the first that covers it. At first, darker pixels count as table in shadow. If too much of the object
-    then looks like the table, they no longer count. Returns None if the object still looks like the table.
+    compared with the first appearance that covers it. At first, darker pixels count as table in shadow. If too much of
+    the object then looks like the table, they no longer count. Returns None if the object still looks like the table.
     """
     differences = []
     for view in progress(views, "bare table"):
@@ -275,9 +275,9 @@ def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 
 def nan_median(stack: np.ndarray) -> np.ndarray:
-    """Return the median over the first axis without the NaN values. It is NaN if all values are NaN.
+    """Return the median over the first axis, ignoring NaN. If all values are NaN, the median is NaN.
 
-    If two values are in the middle, it is the lower one. It is much faster than `np.nanmedian`.
+    If two values are in the middle, the lower one is returned. The function is much faster than `np.nanmedian`.
     """
     middle = np.maximum(np.isfinite(stack).sum(0) - 1, 0) // 2
     return np.take_along_axis(np.sort(stack, 0), middle[None], 0)[0]

@@ -59,8 +59,8 @@ def make_upright(
 ) -> tuple[SparseModel, Plane | None, bool]:
     """Transform model and table to a frame with origin `center` (3,), z up, and cameras at a distance of about 1.
 
-    Returns (model, table, whether up is known). Up is the table's normal. Without a table, up is the mean of `ups`, a
-    dict by the photograph's name of directions (3,) in camera axes. If these cancel out, up is unknown.
+    Returns (model, table, whether up is known). `ups`: up directions (3,) in camera axes, by the photograph's name. Up
+    is the table's normal. Without a table, up is the mean of `ups`. If they cancel out, up is unknown.
     """
     scale = 1 / sparse.distance(center)
     up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in sparse.cameras.items()], 0)
