@@ -23,7 +23,10 @@ def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
 
 
 def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
-    """Return the BRDFs (count, angles, 3) [1/sr] at the `ANGLES`. `bsdf`: one of `count` materials, from `bsdf_of`."""
+    """Return the BRDFs (count, angles, 3) [1/sr] at the `ANGLES`.
+
+    `bsdf`: BSDF of `count` materials, as `bsdf_of` makes it.
+    """
     angle, k = np.tile(ANGLES, count), np.repeat(np.arange(count), len(ANGLES))
     si = dr.zeros(mi.SurfaceInteraction3f, len(angle))
     si.uv = mi.Point2f(mi.Float((k + 0.5) / count), 0.5)

@@ -36,8 +36,8 @@ def run_experiment(
     """Perform all runs, or only those named in `only`. Returns the number of failed runs.
 
     If a run fails, the others go on. The results of the runs are in `out`/runs/. After each run, table.csv, table.md
-    and figure.png are written. If files and settings of a run have not changed, its results are kept. Raises InputError
-    before the first run if options are wrong.
+    and figure.png are written. If the files and settings of a run have not changed, the results of this run are kept.
+    Raises InputError before the first run if options are wrong.
     """
     runs = experiment.runs(options)
     if unknown := set(only) - {run.name for run in runs}:
@@ -111,7 +111,10 @@ def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]
 
 
 def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptions) -> Record:
-    """Fit in this process. Measures the errors of normals and depth `POINTS` times during the fit, and writes them."""
+    """Fit in this process. Measures the errors of normals and depth `POINTS` times during the fit.
+
+    The errors are written to `COURSE` in the results folder. Returns the record of the finished fit.
+    """
     rows: list[Row] = []
 
     def measure(it: Iteration) -> None:

@@ -56,7 +56,7 @@ def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
 def surface_errors(
     run: Run, capture: Capture, ring: FittedObject, s: Tensor, faces: np.ndarray
 ) -> tuple[np.ndarray, Row]:
-    """Return the surface of an object at domain points `s` (V, 3), as vertices (V, 3), and a row with its errors."""
+    """Return (vertices (V, 3), row with errors) of an object's surface at domain points `s` (V, 3)."""
     mesh, truth = load_true_mesh(run.dataset.truth / "mesh.ply")
     with torch.no_grad():
         vertices = ring.surface(s.to(ring.center.device)).cpu().numpy()
