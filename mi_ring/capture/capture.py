@@ -194,7 +194,7 @@ class Capture:
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Split `index` into groups of photographs of one size, at most `most` each. Yields the indices of each group."""
+        """Split `index` into groups of photographs of one size, at most `most` each. Yields the indices of a group."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):

@@ -65,7 +65,7 @@ class Job:
         return record
 
     def fingerprint(self) -> str:
-        """Return a hash of the options, of the scene file, and of all files that options or scene file name."""
+        """Return a hash of the options, of the scene file, and of all files that these two mention."""
         result = hashlib.blake2b(repr(self.options).encode(), digest_size=16)
         with contextlib.suppress(OSError):  # the fit reports what is wrong with the scene file
             text = self.scene.read_bytes()

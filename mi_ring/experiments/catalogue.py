@@ -75,7 +75,7 @@ def table2(options: ExperimentOptions) -> list[Run]:
 
 
 def table3(options: ExperimentOptions) -> list[Run]:
-    """List three runs for each dataset and seed: exact cameras, wrong cameras, and wrong cameras that the fit refines."""
+    """List three runs for each dataset and seed: exact cameras, wrong cameras, and wrong ones that the fit refines."""
     runs = []
     for exact in datasets(options):
         for seed in options.seeds:

@@ -147,7 +147,7 @@ def interrupted() -> bool:
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """A context manager for work that the same command can continue. On a signal of `SIGNALS`, it prints this advice.
+    """A context manager for work that the same command can continue. On a signal of `SIGNALS`, it prints this hint.
 
     It then raises Interrupted, even if a library turns the signal into another error. Only the main thread receives
     signals.

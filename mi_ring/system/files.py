@@ -1,4 +1,4 @@
-"""Writes files such that they are complete or absent. Also checksums and locks of folders."""
+"""Writes files such that they are complete or absent. Also computes checksums, and locks folders."""
 
 import contextlib
 import errno
