@@ -165,7 +165,7 @@ def set_threads(count: int = 0) -> None:
 def computer() -> str:
     """Return a text with the model of the processor and the number of `cores`, for reports.
 
-    If the current variant uses a GPU, the text begins with its name.
+    If the current variant uses a GPU, the text begins with the name of the GPU.
     """
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
