@@ -16,7 +16,7 @@ from mi_ring.system.files import require_place, write_file
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """Write a sheet of markers to print and put under the object. With it, mi-ring photos finds scale and light."""
+    """Write a sheet of markers to print and put under the object. From it mi-ring photos finds scale and flash."""
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """File to write: .pdf to print, or .png."""

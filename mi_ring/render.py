@@ -78,7 +78,7 @@ def require_options(config: RenderConfig) -> None:
 
 
 def require_writable(views: list[RenderedView], capture: Capture, config: RenderConfig) -> None:
-    """Raise InputError if pictures cannot be written, or would overwrite each other or the photographs."""
+    """Raise InputError if the pictures cannot be written, or if they would overwrite each other or photographs."""
     if config.film:
         sizes = sorted({view.shot.size for view in views})
         if len(sizes) > 1:

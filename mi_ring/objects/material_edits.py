@@ -23,15 +23,15 @@ class MaterialOptions:
     """Options that change the material of an object."""
 
     material: Path | None = None
-    """Results folder of another fit. The object gets the material of that fit. Without it: its own material.
+    """Results folder of another fit. The object gets the material of that fit. Without this option: its own material.
     Both fits must start from the same surface, or from surfaces without handles (like a sphere, not like a ring)."""
     specular_scale: float = 1.0
-    """Factor for the specular reflectance, 0 or more. Above 1, for example 2: stronger highlights. 0: no highlights."""
+    """Factor of the specular reflectance, 0 or more. Above 1, for example 2: stronger highlights. 0: no highlights."""
     roughness_add: float = 0.0
-    """Number to add to the roughness, for example 0.1 or -0.1. Above 0: wider highlights. Below 0: sharper ones.
-    The sum stays within the range that the material allows, at most 0 to 1."""
+    """Number to add to the roughness, for example 0.1 or -0.1. Above 0: wider highlights. Below 0: narrower highlights.
+    The command clips the sum to the range of the material's roughness, at most 0 to 1."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors for red, green and blue of the object's colours, 0 or more. 1 1 1: no change. 1 0.8 0.8: redder."""
+    """Factors of red, green and blue in the object's colours, 0 or more. 1 1 1: no change. 1 0.8 0.8: more red."""
 
 
 def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
