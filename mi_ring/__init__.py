@@ -84,7 +84,7 @@ def __dir__() -> list[str]:
 
 
 def _command_looked_for() -> str | None:
-    """Return the module that `python -m` is about to run, such as `mi_ring.fit`; None if it is no command of mi_ring."""
+    """Return the module of mi_ring that `python -m` is about to run, such as `mi_ring.fit`; None if there is none."""
     names = sys.orig_argv if sys.argv[:1] == ["-m"] else ()
     return next(filter(re.compile(r"mi_ring\.\w+").fullmatch, names), None)
 

@@ -209,7 +209,7 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
 
 
 def encoded_picture(picture: Image.Image, kind: str = "PNG", **options: Any) -> bytes:
-    """Encode a Pillow image in the file format `kind` and return the bytes. `options`: the options of Pillow's `save`."""
+    """Encode a Pillow image in the file format `kind`. Returns the bytes. `options`: options of Pillow's `save`."""
     buffer = io.BytesIO()
     picture.save(buffer, kind, **options)
     return buffer.getvalue()

@@ -166,7 +166,7 @@ def require_apart(config: PhotosConfig) -> None:
 
 
 def make(config: PhotosConfig, scene: Path) -> None:
-    """Make the capture and write its scene file `scene` and its images. Stages with results in work/ are not repeated."""
+    """Make the capture and write it: the file `scene` and images. Stages with results in work/ are not repeated."""
     pictures = folder.find_pictures(config.folder, upright=detect(config.folder) is None)
     if dark := folder.without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")

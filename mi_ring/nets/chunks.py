@@ -75,7 +75,7 @@ def in_parallel(function: Callable, *arguments: Sequence) -> list:
 
 
 def pool(threads: int) -> ThreadPoolExecutor:
-    """Return this process's pool of worker threads. Makes a new pool if there is none with at least `threads` threads."""
+    """Return this process's pool of worker threads. If it has fewer than `threads` threads, make a new pool."""
     global _pool
     with _lock:
         if _pool is None or _pool[0] != os.getpid() or _pool[1] < threads:  # a fork does not copy threads

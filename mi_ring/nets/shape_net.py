@@ -45,7 +45,7 @@ class Flow(nn.Module):
         return x
 
     def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
-        """Compute Φ(x, time) for points (V, 3). `time`: in [0, 1]; if it is between two steps, the last one is shorter."""
+        """Compute Φ(x, time) for points (V, 3) and a `time` in [0, 1]. Between two steps, the last one is shorter."""
         steps = int(time * self.steps)
         x, rest = self.flow(x, steps) if steps else x, time - steps / self.steps
         return x + rest * self.velocity_of(steps)(x) if rest else x

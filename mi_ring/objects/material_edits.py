@@ -1,4 +1,4 @@
-"""Edits of fitted materials, and their transfer between objects."""
+"""Edits fitted materials and transfers them to other objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,7 +35,10 @@ class MaterialOptions:
 
 
 def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
-    """Apply the options to the material of an object. Raises InputError if the material does not allow them."""
+    """Change the material of `ring` in place, as the options say.
+
+    Raises InputError if an option is out of range, or if the material lacks the parameter that an option changes.
+    """
     if options.material:
         other = load_fit(options.material)
         ring.bsdf, ring.brdf_net = other.bsdf, other.brdf_net
@@ -65,7 +68,10 @@ def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
 
 
 def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> list[str]:
-    """The parameters of the material that are among `names`. Raises InputError if there is none."""
+    """List the parameters of the object's material whose name is among `names`.
+
+    Raises InputError, which begins with the `option`, if there is no such parameter.
+    """
     parameters = [p.name for p in ring.brdf_net.bsdf_parameters]
     found = [name for name in parameters if name in names]
     if not found:
@@ -74,7 +80,10 @@ def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> l
 
 
 class TransferredMaterial(MaterialNet):
-    """A BRDF-Net of the domain `there`, evaluated on the domain `here`. Both are mapped to the sphere."""
+    """Evaluates the BRDF-Net `net` of the domain `there` at points of another domain, `here`.
+
+    The maps of both domains to the unit sphere give corresponding points.
+    """
 
     def __init__(self, net: MaterialNet, here: SphericalMap, there: SphericalMap) -> None:
         super().__init__(net.bsdf_parameters, float(net.scale))
@@ -86,7 +95,10 @@ class TransferredMaterial(MaterialNet):
 
 
 class EditedMaterial(MaterialNet):
-    """A BRDF-Net with gains and offsets by parameter name. Values stay within the parameters' ranges."""
+    """Evaluates the BRDF-Net `net`, and multiplies each parameter by its gain and adds its offset.
+
+    `gains`, `offsets`: by name of the parameter. Results are clipped to the ranges of the parameters.
+    """
 
     def __init__(self, net: MaterialNet, gains: dict, offsets: dict) -> None:
         super().__init__(net.bsdf_parameters, float(net.scale))
