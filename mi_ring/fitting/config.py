@@ -1,4 +1,4 @@
-"""The settings of a fit. `Config` joins three frozen dataclasses: common settings, tuning and ablation.
+"""The settings of a fit. `Config` joins three frozen dataclasses: `Common`, `Tuning` and `Ablation`.
 
 The docstrings of the fields are the help texts of `mi-ring fit`. The help keeps their line breaks.
 """
@@ -178,10 +178,10 @@ class Ablation:
 
 @dataclass(frozen=True, kw_only=True)
 class Config(Ablation, Tuning, Common):
-    """The settings of a fit: all that defines its result except the photographs.
+    """The settings of a fit. Settings and photographs together define the result.
 
-    Its fields are those of `mi_ring.fitting.config.Common`, `mi_ring.fitting.config.Tuning` and
-    `mi_ring.fitting.config.Ablation`. `Config.preset` gives settings that go together. Raises InputError for a value
+    The fields are those of `mi_ring.fitting.config.Common`, `mi_ring.fitting.config.Tuning` and
+    `mi_ring.fitting.config.Ablation`. `Config.preset` returns the settings of a preset. Raises InputError if a value is
     out of range.
     """
 
@@ -230,8 +230,8 @@ class Config(Ablation, Tuning, Common):
     def preset(cls, name: str, **changes: Any) -> "Config":
         """Return the settings of the preset `name`: `fast`, `default`, `fine` or `paper`.
 
-        `changes` replace single settings. A `weights` among the changes replaces only the weights that it names. Raises
-        InputError for an unknown preset.
+        `changes`: other values for single settings. `weights` replaces only the weights that it contains. Raises
+        InputError for an unknown preset and for a value that is out of range.
         """
         if name not in PRESETS:
             raise InputError(f"preset: is {name}, must be one of {', '.join(PRESETS)}")
@@ -242,10 +242,10 @@ class Config(Ablation, Tuning, Common):
 
     @staticmethod
     def load(path: str | Path) -> "Config":
-        """Read the settings of an earlier fit, from its results folder or from the config.json in it.
+        """Read the settings of an earlier fit. `path`: its results folder, or the config.json in this folder.
 
-        Settings without an entry have their defaults. Raises InputError, which names file and field, for an unknown
-        setting or a wrong value.
+        A setting that the file does not contain gets its default. Raises InputError, which names file and setting, for
+        an unknown setting or a wrong value.
         """
         path = Path(path)
         path = path / "config.json" if path.is_dir() else path
@@ -281,7 +281,7 @@ class Config(Ablation, Tuning, Common):
 
 
 def of_type(kind: Any, value: Any) -> Any:
-    """Convert `value`, read from JSON, to the type `kind` of a setting. Raises ValueError if that is impossible."""
+    """Convert a `value` from a JSON file to the type `kind` of a setting. Raises ValueError if this is impossible."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         for one in inner:
@@ -302,7 +302,7 @@ def of_type(kind: Any, value: Any) -> Any:
 
 
 def as_typed(value: Any) -> str:
-    """Format the value of a setting as the user types it on the command line; for messages."""
+    """Format the value of a setting, for messages, as the user types it on the command line."""
     if isinstance(value, dict):
         value = [word for item in value.items() for word in item]
     if isinstance(value, (tuple, list)):
