@@ -152,7 +152,7 @@ class Calibration(nn.Module):
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Convert recorded values (N, H, W, 3) to scene radiance. It is the inverse of `recorded`, without gradients."""
+        """Convert recorded values (N, H, W, 3) to scene radiance: the inverse of `recorded`, without gradients."""
         response = self.response()
         return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
 

@@ -108,7 +108,7 @@ class Rig:
         return Estimate(self.views, none, none, none, none, self.response)
 
     def views_of(self, estimate: Estimate) -> Views:
-        """Return the cameras and lights of an estimate: the lights are moved by its offsets and scaled by its factors."""
+        """Return the cameras and lights of an estimate. Its offsets move the lights, its factors scale them."""
         now = estimate.views
         offset = (self.free * estimate.offset).expand(self.count("light"), 3)[self.place]
         if self.flash is not None:
