@@ -1,4 +1,4 @@
-"""Views to render: the photographs of a scene, or the frames of a film."""
+"""The views that mi-ring render renders: the photographs of a scene, or the frames of a film."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -110,9 +110,9 @@ class RenderedView:
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
-    """Make the Mitsuba integrator that the options name; None for `photometric`.
+    """Make the Mitsuba integrator that the options name. Returns None for `photometric`.
 
-    Raises InputError for an unknown name.
+    Raises InputError for an unknown name, and for an integrator that does not start at the camera.
     """
     name = config.integrator or ("path" if config.envmap else "photometric")
     if name == "photometric":
@@ -127,7 +127,10 @@ def integrator_of(config: RenderConfig) -> mi.Integrator | None:
 
 
 def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list[RenderedView]:
-    """List the views to render: the photographs of the scene, or the frames of a film."""
+    """List the views to render: the photographs of the scene, or the frames of a film. Renders nothing.
+
+    Raises InputError if --view names no photograph, or if --light-orbit has no light to move.
+    """
     count = config.count
     if not count:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in capture.names]
@@ -169,12 +172,12 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
 
 
 def up_of(capture: Capture, config: RenderConfig) -> np.ndarray:
-    """Return the up direction (3,), unit length: from the options, otherwise from the capture."""
+    """Return the up direction as a unit vector (3,): from --up if it is given, otherwise from the capture."""
     return capture.up if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
 
 
 def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """Rotate and zoom a camera, without moving it, so that object and start surface fill the picture.
+    """Rotate and zoom a camera so that object and start surface fill the picture. The camera keeps its position.
 
     Returns (new camera, centre (3,) of the object [scene units]). `up` (3,): up direction.
     """
@@ -196,7 +199,11 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
 
 
 def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
-    """Return the object in the scene; with --envmap under that environment and the scene's lamps, without a table."""
+    """Make the surface that is rendered: the object in the scene.
+
+    With --envmap, the environment map replaces the lights of the photographs, and tables are left out. Raises
+    InputError if the file of the environment map cannot be read.
+    """
     if not config.envmap:
         return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
     to_world = np.eye(4)
@@ -217,7 +224,10 @@ def render_views(
     surface: Surface, ring: FittedObject, views: list[RenderedView], integrator: mi.Integrator | None,
     capture: Capture, config: RenderConfig,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """Render the views one by one: pictures (H, W, 3) of linear radiance."""
+    """Render the views one by one. Yields pictures (H, W, 3) of linear radiance.
+
+    `integrator`: from `integrator_of`; None: photometric.
+    """
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
     for k, view in enumerate(progress(views, "rendering", unit="picture", leave=True)):
@@ -234,9 +244,10 @@ def render_views(
 
 
 def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """Render a picture (H, W, 3) with a Mitsuba integrator in several passes, and average these.
+    """Render a picture (H, W, 3) with a Mitsuba integrator in several passes, and return their average.
 
-    So memory does not grow with `spp`. A pass has at most `LANES` rays, but at least one per pixel.
+    With several passes, the memory does not grow with `spp`. A pass has at most `LANES` rays, but at least one per
+    pixel.
     """
     width, height = sensor.camera.size
     at_once = min(spp, max(1, LANES // (width * height)))

@@ -153,13 +153,13 @@ class SynthesizeConfig:
 
     @property
     def exact(self) -> bool:
-        """Is the calibration in the scene file exact: no --wrong-… is given?"""
+        """Is the calibration in the scene file exact? It is not if an option --wrong-… changes it."""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
     def up_axis(self) -> np.ndarray:
-        """The unit vector (3,) that points up."""
+        """Unit vector (3,) that points up."""
         return np.eye(3)["xyz".index(self.up)]
 
     @property
