@@ -54,7 +54,7 @@ class EvaluateConfig:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(EvaluateConfig, arguments, "mi_ring.evaluate")
     require_range(config, "spp", 1)
     for name in ("scene.xml", "mesh.ply", "ring.pt"):

@@ -74,7 +74,7 @@ def seen_from(run: Path) -> list[MaskedCamera] | None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(ExportConfig, arguments, "mi_ring.export")
     require_options(config)
     ring = load_fit(config.run)

@@ -135,7 +135,7 @@ def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedO
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)

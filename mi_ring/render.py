@@ -20,7 +20,7 @@ from mi_ring.system.files import writing
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(RenderConfig, arguments, "mi_ring.render")
     require_options(config)
     ring = load_fit(config.run)

@@ -126,10 +126,7 @@ class Fit(Renamed):
         return it
 
     def evaluate(self, batch: Batch, observation: Observation) -> tuple[Tensor, Iteration]:
-        """Predict a batch. Returns (its loss with the autograd graph, the iteration).
-
-        `observation`: the observed photographs of the batch. The fit does not change, so a step may call this again.
-        """
+        """Predict a batch, and return (its loss with the autograd graph, iteration). It does not change the fit."""
         it = Iteration(batch, observation, self.renderer.predict(self.problem, self.model, batch), self.context())
         return self.loss(it), it
 
@@ -180,8 +177,7 @@ class Fit(Renamed):
     def save(self, folder: str | Path) -> None:
         """Write `ring.pt`, `mesh.ply`, `scene.xml`, `report.html` and other results into a folder.
 
-        Results of an earlier fit in this folder are moved aside. Raises InputError if a file cannot be written,
-        ValueError if a network is not registered.
+        Earlier results are moved aside. Raises InputError if that fails, ValueError for networks without a name.
         """
         results.save(Path(folder), self.result())
 

@@ -171,8 +171,8 @@ class CoarseFits:
     def with_material(self, lighting: Lighting) -> Lighting:
         """Decide whether a fit under this lighting should begin with one material for the whole object.
 
-        It should if one material explains the photographs about as well. Returns the lighting with this decision and
-        with the lamps that the coarse fit has found.
+        Runs a coarse fit with one material. If it explains the photographs about as well, the fit should. Returns the
+        lighting with this decision and with the lamps that the coarse fit has found.
         """
         one = lighting._replace(one_material_until=1.0)
         if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):
@@ -181,9 +181,9 @@ class CoarseFits:
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
-    """List the options of `Config.refine` for a coarse fit under `lighting`; `config` has those of the real fit.
+    """List the options of `Config.refine` for a coarse fit under `lighting`. `config`: settings of the real fit.
 
-    A coarse fit refines only the camera response, and with the scene's own lights also these lights.
+    A coarse fit refines the camera response. If the lights are those of the scene, it also refines these lights.
     """
     own = {*OWN_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
     return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDING, *own}) or ("none",)

@@ -103,7 +103,7 @@ class Team(Processes):
                               "checkpoint with the same command and --resume") from error  # fmt: skip
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """See `Processes`."""
+        """Return the sum of a tensor over all processes; see `Processes.sum`."""
         place = device() if self.nccl else torch.device("cpu")
         total = tensor.detach().to(place, copy=True).contiguous()
         self.exchanged, self.exchanges = self.exchanged + total.numel() * total.element_size(), self.exchanges + 1
@@ -111,13 +111,16 @@ class Team(Processes):
         return total.to(tensor.device)
 
     def broadcast(self, value: Value) -> Value:
-        """See `Processes`."""
+        """Return the first process's `value` in all processes. It is sent by pickle."""
         box = [pickle.dumps(value) if self.rank == 0 else None]
         self.attempt(lambda: self.distributed.broadcast_object_list(box))
         return value if self.rank == 0 else pickle.loads(box[0])  # type: ignore[arg-type]
 
     def agreed(self, work: Callable[[], Value]) -> Value:
-        """See `Processes`. If several processes fail, all raise the message of the first of them."""
+        """Call `work` in each process. If it fails in one process, all raise InputError; see `Processes.agreed`.
+
+        If it fails in several processes, all raise the message of the first of them.
+        """
         result: Any = None
         error: InputError | None = None
         try:
@@ -133,7 +136,7 @@ class Team(Processes):
         return result
 
     def on_first(self, work: Callable[[], Value]) -> Value:
-        """See `Processes`."""
+        """Call `work` in the first process only. Returns its result in all processes; see `Processes.on_first`."""
         outcome: Any = None
         try:
             outcome = ("value", work()) if self.rank == 0 else None
@@ -149,17 +152,17 @@ class Team(Processes):
         return value
 
     def maximum(self, number: int) -> int:
-        """See `Processes`."""
+        """Return the largest `number` of all processes."""
         numbers = torch.tensor([number])
         self.attempt(lambda: self.distributed.all_reduce(numbers, self.distributed.ReduceOp.MAX))
         return int(numbers)
 
     def barrier(self) -> None:
-        """See `Processes`."""
+        """Wait until all processes have called this method."""
         self.maximum(0)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """See `Processes`. All gradients are sent together."""
+        """Replace the gradients by their sums over all processes. All gradients are sent together."""
         place = device()
         has = torch.tensor([float(p.grad is not None) for p in parameters])
         grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]

@@ -134,5 +134,5 @@ class Renderer:
         return self.averages
 
     def restore(self, state: Averages) -> None:
-        """Continue from `state`, a result of `state()`."""
+        """Continue with the averages in `state`, a result of `state()`."""
         self.averages = state

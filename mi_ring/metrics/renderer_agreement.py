@@ -80,7 +80,10 @@ def sidak(p: Sequence[float] | np.ndarray) -> float:
 
 
 def compare_renderers(name: str, pictures: Pictures) -> Comparison:
-    """Compare both renderers in one photograph. Raises InputError if pixels are NaN or infinite."""
+    """Compare the pictures of both renderers for the photograph `name`.
+
+    Raises InputError if pixels are NaN or infinite.
+    """
     for which, picture in vars(pictures).items():
         if bad := int((~np.isfinite(picture)).any((0, 3)).sum()):
             raise InputError(f"{name}: {which}: {bad} pixels are NaN or infinite; check BSDF and mesh")

@@ -1,4 +1,9 @@
-"""Edges as curves in space: samples of them, and the outlines and borders of shapes that are not meshes."""
+"""Edges as curves in space: samples of them, and the outlines and borders of shapes that are not meshes.
+
+`CURVES` has functions for the curves of these shapes, in local coordinates. Their arguments are the eye e, which is a
+point if w = 1 and a direction if w = 0, then w, and the curve parameter t in [0, 1). They return (point p, dp/dt, a
+point of the shape beside p).
+"""
 
 from dataclasses import dataclass
 
@@ -47,7 +52,7 @@ def circle(u, v, t):
 
 
 def square_border(e, w, t):
-    """Evaluate the border of the square [-1, 1]². Arguments and result: as for all `CURVES`."""
+    """Evaluate the border of the square [-1, 1]². Arguments and result: see the docstring of the module."""
     side, along = dr.floor(4 * t), 8 * (t - 0.25 * dr.floor(4 * t)) - 1
     x = dr.select(side == 0, along, dr.select(side == 1, 1, dr.select(side == 2, -along, -1)))
     y = dr.select(side == 0, -1, dr.select(side == 1, along, dr.select(side == 2, 1, -along)))
@@ -57,13 +62,13 @@ def square_border(e, w, t):
 
 
 def disk_border(e, w, t):
-    """Evaluate the border of the unit disk. Arguments and result: as for all `CURVES`."""
+    """Evaluate the border of the unit disk. Arguments and result: see the docstring of the module."""
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
     return mi.Point3f(p), dp, mi.Point3f(0)
 
 
 def cylinder_border(e, w, t, z):
-    """Evaluate the circle at the end `z` of the unit cylinder. Other arguments and result: as for all `CURVES`."""
+    """Evaluate the circle at the end `z` of the unit cylinder. Other arguments and result: see the module."""
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
     return mi.Point3f(p.x, p.y, z), dp, mi.Point3f(p.x, p.y, 0.5)
 
@@ -71,7 +76,7 @@ def cylinder_border(e, w, t, z):
 def sphere_outline(e, w, t):
     """Evaluate the outline of the unit sphere: points p with p · e = w, whose normal is perpendicular to the view.
 
-    Arguments and result: as for all `CURVES`.
+    Arguments and result: see the docstring of the module.
     """
     e2 = dr.squared_norm(e)
     frame = mi.Frame3f(e * dr.rsqrt(e2))
@@ -83,7 +88,7 @@ def sphere_outline(e, w, t):
 def cylinder_outline(e, w, t, side=1.0):
     """Evaluate one of the two lines in the outline of the cylinder x² + y² = 1, 0 < z < 1. `side`, 1 or -1, says which.
 
-    Other arguments and result: as for all `CURVES`.
+    Other arguments and result: see the docstring of the module.
     """
     e2 = e.x * e.x + e.y * e.y
     r = side * dr.sqrt(dr.maximum(1 - w * w / e2, 0)) * dr.rsqrt(e2)
