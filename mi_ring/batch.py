@@ -50,8 +50,8 @@ class BatchConfig:
     """Memory that one fit needs [GiB], for example 4. 0: no limit.
     A machine then runs only as many fits at a time as its memory allows."""
     retries: int = 3
-    """Number of restarts of a fit whose process died, 0 or more. The count begins anew when the fit makes progress.
-    After so many restarts without progress the fit has failed. A restarted fit continues from its checkpoint.
+    """How often a fit is restarted after its process has died, 0 or more. Only restarts without progress count.
+    If the process dies once more, the fit has failed. A restarted fit continues from its checkpoint.
     Raise the number if other programs often stop the fits."""
     address: str | None = None
     """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without this option: this machine alone."""

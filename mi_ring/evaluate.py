@@ -38,7 +38,7 @@ class EvaluateConfig:
     """PLY, OBJ or GLB file of the true surface, in the units and the frame of the scene.
     For a capture of mi-ring synthesize or mi-ring example it is truth/mesh.ply."""
     novel: Path | None = None
-    """Scene file of photographs that the fit has not used. The command predicts them and compares the predictions.
+    """Scene file of photographs that the fit has not used. The command predicts them and measures the errors.
     Without this option: only the photographs of the fit are compared."""
     seen: bool = False
     """Compute Chamfer distance and F-score only for the parts of the surfaces that a photograph of the fit shows.

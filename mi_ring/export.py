@@ -48,8 +48,7 @@ class ExportConfig(MaterialOptions):
     0.5: the surface after half of the deformation."""
     metres: float | None = None
     """Length of a scene unit [m], to give the object its real size. 0.001: the unit is the millimetre. Only for .glb.
-    Without this option: the length in the capture, if it has one. A capture of photographs with the printed sheet does.
-    """
+    Without this option: the length in the capture. Captures of mi-ring photos with the printed sheet have one."""
 
 
 def require_options(config: ExportConfig) -> None:

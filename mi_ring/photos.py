@@ -65,8 +65,8 @@ class PhotosConfig:
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the flash relative to the lens: right, down, forward. 30 -60 0: 30 mm to the right, 60 mm above.
     The unit is the millimetre. If there is no printed sheet, it is the median distance from the cameras to the object.
-    Measure the position while you hold the camera as in most photographs. The command corrects it in two ways: it turns
-    it with the camera in other photographs, and it improves it if the photographs show the printed sheet."""
+    Measure while you hold the camera as in most photographs. For photographs with the camera on its side, the command
+    turns the flash with the camera. If the photographs show the printed sheet, the command refines the position."""
     turntable: bool = False
     """Set this option if the object turned on a turntable while camera and flash stood still.
     The printed sheet of `mi-ring board` must lie under the object and turn with it."""

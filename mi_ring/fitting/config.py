@@ -81,8 +81,7 @@ class Common:
     single photographs: cameras, power and gain."""
     iterations: int = 460
     """Number of iterations of all stages together, for example 1400. More iterations give finer detail and take longer.
-    A fit that starts from a hull or a mesh makes fewer iterations. A fit under an unknown environment makes 15 % more.
-    """
+    A fit from a hull or a mesh makes fewer iterations. A fit under an unknown environment makes 15 % more."""
     seed: int = 0
     """Random seed. Fits with different seeds show how much results vary by chance."""
     deterministic: bool = False
@@ -120,11 +119,11 @@ class Tuning:
     mask: the silhouettes agree with the masks.
     velocity: the deformation is smooth (the paper's lambda). Raise it for noisy photographs, lower it for fine detail.
     calibration: the corrections of --refine stay small.
-    settling: the material varies little over the surface. Only in the last stage of a fit with an unknown environment.
+    settling: the material varies little over the surface. Only in the last stage under an unknown environment.
     normal_variation: the surface has flat faces and sharp edges. Try 0.01 if the object has them.
     material_rank: the material is a mixture of few materials. Try 0.01 if the object has few materials."""
     velocity_decay: float = 0.03
-    """The weight of the term velocity falls to this share of --weights.velocity during the fit. Above 0; 1: constant.
+    """During the fit, the weight of velocity falls to this share of --weights.velocity, above 0. 1: it stays constant.
     A small share gives finer detail. In a short fit a small share may let the surface fold over."""
     laplacian_scale: float = 0.01
     """How much the term velocity penalises high frequencies of the deformation, 0 or more (the paper's alpha).
@@ -135,7 +134,7 @@ class Tuning:
     """Learning rate of Muon at the start. Muon trains the hidden layers of the networks. --optimizer adam has no Muon.
     Raise it for faster progress. Lower it if the loss does not fall steadily."""
     decay: float = 0.1
-    """The learning rates fall to this share of their first values during the fit. Above 0; 1: constant.
+    """During the fit, the learning rates fall to this share of their first values, above 0. 1: they stay constant.
     With a smaller share the surface changes less at the end. The learning rates of cameras fall to one half instead."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Number format of matrix products. auto: bfloat16 if it is faster than float32 on this machine.
