@@ -118,7 +118,7 @@ class Tuning:
     rgb: the colours agree with the photographs.
     mask: the silhouettes agree with the masks.
     velocity: the deformation is smooth (the paper's lambda). Raise it for noisy photographs, lower it for fine detail.
-    calibration: the corrections of --refine stay small.
+    calibration: the corrected calibration stays near the calibration of the scene file.
     settling: the material varies little over the surface. Only in the last stage under an unknown environment.
     normal_variation: the surface has flat faces and sharp edges. Try 0.01 if the object has them.
     material_rank: the material is a mixture of few materials. Try 0.01 if the object has few materials."""
