@@ -92,9 +92,9 @@ class Edges:
         return edge, first, second
 
     def sample(self, lanes, seed, before=0, shadow=False) -> EdgeSamples:
-        """Sample points on edges, stratified. `lanes`: the edges, see `sides`. `shadow`: they are edges of shadows.
+        """Choose random points on edges, stratified along each edge. Returns at least four per edge.
 
-        `before`: see `Photographs.before`.
+        `lanes`: the edges, see `sides`. `before`: see `Photographs.before`. `shadow`: the edges are edges of shadows.
         """
         count = dr.width(self.kind)
         each = max(SAMPLES, MIN_SAMPLES // count)
