@@ -45,9 +45,10 @@ def reading(where: Path | str, what: str) -> Iterator[None]:
 
 
 def require_plausible_size(path: Path, size: int) -> None:
-    """Raise ValueError if the content that a file declares is implausibly large for the size of the file.
+    """Raise ValueError if a file is too small for the content that it declares. Reading it could exhaust the memory.
 
-    `size`: the declared content, uncompressed [bytes].
+    `size`: number of bytes of the content, as the file declares it. It may be up to `EXPANSION` times the size of the
+    file on disk, or up to `SMALL` if that is more.
     """
     if size > max(SMALL, EXPANSION * path.stat().st_size):
         raise ValueError(f"declares {size:,} bytes, in a file of {path.stat().st_size:,}")
