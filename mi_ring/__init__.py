@@ -1,10 +1,11 @@
-"""From photographs to a watertight mesh with a spatially varying material, inside Mitsuba 3.
+"""Reconstructs a watertight mesh with a spatially varying material from photographs, inside Mitsuba 3.
 
 `import mi_ring` registers its plugins (`photograph`, `shapenet`, `cooktorrance`, `photometric`, `flash` and others) for
-the current variant of Mitsuba and for every variant that is selected later. If no variant is selected yet, it selects
-`llvm_ad_rgb`. Without LLVM it selects `scalar_rgb` and warns: this variant can show a fit, slowly, but cannot make one.
+the current variant of Mitsuba and for every variant that is selected later. If no variant is selected yet, the import
+selects `llvm_ad_rgb`. Without LLVM it selects `scalar_rgb` and warns: `scalar_rgb` shows a finished fit, slowly, but
+makes no fits.
 
-The names of the Python API are imported when they are first used:
+The package imports each name of the Python API at its first use:
 
     capture = mi_ring.load_capture("pot2.xml")
     fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast"))
@@ -83,7 +84,7 @@ def __dir__() -> list[str]:
 
 
 def _command_looked_for() -> str | None:
-    """The module that `python -m` is about to run, such as `mi_ring.fit`; None if it is no command of ours."""
+    """Return the module of mi_ring that `python -m` is about to run, such as `mi_ring.fit`; None if there is none."""
     names = sys.orig_argv if sys.argv[:1] == ["-m"] else ()
     return next(filter(re.compile(r"mi_ring\.\w+").fullmatch, names), None)
 

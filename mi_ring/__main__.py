@@ -1,4 +1,4 @@
-"""The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
+"""The program `mi-ring`: `mi-ring fit …` does the same as `python -m mi_ring.fit …`."""
 
 import ast
 import difflib
@@ -21,14 +21,14 @@ COMMANDS = (
 
 
 def summary(name: str) -> tuple[str, str]:
-    """Usage and description of a command, from the docstring of its module. The module is not imported."""
+    """Read (usage, description) of the command `name` from the docstring of its module, without an import."""
     source = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
     sentence, _, call = (ast.get_docstring(ast.parse(source)) or "").split("\n")[0].partition("`python -m mi_ring.")
     return f"mi-ring {call.partition('`')[0] or name}", sentence.rstrip(" :.")
 
 
 def overview() -> str:
-    """The help of `mi-ring`: two lines for each command."""
+    """Return the help text of `mi-ring`: two lines for each command."""
     lines = [f"  {usage}\n      {sentence}" for usage, sentence in map(summary, COMMANDS)]
     return "\n".join([
         "usage: mi-ring COMMAND …", "", *lines, "",
@@ -38,14 +38,17 @@ def overview() -> str:
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int | None:
-    """Import a command and run it. Raises InputError if Mitsuba cannot be imported; only `doctor` works without it."""
+    """Import the command `name` and run it. Returns its exit status; None stands for 0.
+
+    Raises InputError if Mitsuba cannot be imported. Only `doctor` works without Mitsuba.
+    """
     if name != "doctor" and not llvm.has_atomic():
         raise InputError(str(llvm.missing()))
     return importlib.import_module(f"mi_ring.{name}").main(arguments)
 
 
 def main() -> None:
-    """The `mi-ring` program: `mi-ring fit …` is `python -m mi_ring.fit …`."""
+    """Run the command that the first argument of the program names, and end the process with its exit status."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name in ("-h", "--help", "--version"):
         run("mi-ring", lambda _: print(__version__ if name == "--version" else overview()), [])

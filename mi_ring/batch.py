@@ -27,10 +27,10 @@ RESERVED = "--out", "--resume", "--threads"  #: options of fits that the batch s
 class BatchConfig:
     """Reconstruct many objects, several at a time, on this machine or on a Ray cluster.
 
-    Options after -- are options of mi_ring.fit and hold for all fits. A fit whose process or machine dies continues
-    from its last checkpoint. A fit whose input is wrong fails, and the others continue. The same command again does
-    what is unfinished; finished fits are left out unless their files or options have changed. The exit status is 1 if a
-    fit is not done.
+    Options after -- are options of mi_ring.fit and hold for all fits. If the process or machine of a fit dies, the
+    command continues this fit from its last checkpoint. If the input of a fit is wrong, this fit fails and the others
+    continue. Give the same command again to make the fits that are not done. It repeats a finished fit only if its
+    files or options have changed. The exit status is 1 if a fit is not done.
     """
 
     scenes: Positional[Annotated[tuple[Path, ...], arg(metavar="SCENE.xml")]]
@@ -50,10 +50,11 @@ class BatchConfig:
     """Memory that one fit needs [GiB], for example 4. 0: no limit.
     A machine then runs only as many fits at a time as its memory allows."""
     retries: int = 3
-    """How many times in a row a fit that died is restarted without progress in between, 0 or more. Then it has failed.
-    A restarted fit continues from its checkpoint. Raise the number if other programs often stop the fits."""
+    """How often a fit is restarted after its process has died, 0 or more. Only restarts without progress count.
+    If the process dies once more, the fit has failed. A restarted fit continues from its checkpoint.
+    Raise the number if other programs often stop the fits."""
     address: str | None = None
-    """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without it: this machine alone."""
+    """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without this option: this machine alone."""
 
     def __post_init__(self) -> None:
         for name, least in (("workers", 1), ("cpus", 0), ("gpus", 0), ("memory", 0), ("retries", 0)):
@@ -104,7 +105,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def unfinished(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
-    """The jobs to fit, with their fingerprints. Writes the records of all jobs; a wrong capture is a failed job."""
+    """Find the jobs that are not done yet. Returns the fingerprint of each by job.
+
+    Writes the record of every job. A job whose capture is invalid is not returned; its record says that it failed.
+    """
     todo: dict[Job, str] = {}
     done = 0
     for job in progress(jobs, "comparing", unit="scene"):
@@ -155,7 +159,7 @@ def fit_and_report(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchCo
 
 
 def write_page(jobs: Sequence[Job], out: Path, running: bool) -> None:
-    """Write index.html."""
+    """Write index.html into the folder `out`. `running`: fits are still running, so the page reloads itself."""
     entries = []
     for job in jobs:
         record = job.record

@@ -16,7 +16,10 @@ from mi_ring.system.files import require_place, write_file
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """Write a sheet of markers to print and put under the object. With it, mi-ring photos finds scale and light."""
+    """Write a sheet of markers. Print it and put it under the object before you take photographs.
+
+    With the sheet in the photographs, mi-ring photos finds the scale and the position of the flash.
+    """
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """File to write: .pdf to print, or .png."""
@@ -25,7 +28,7 @@ class BoardConfig:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(BoardConfig, arguments, "mi_ring.board", needs_llvm=False)
     file, kind = config.file, config.file.suffix.lower()
     if kind not in (".pdf", ".png"):

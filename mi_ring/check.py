@@ -19,21 +19,22 @@ from mi_ring.system.progress import Step, Steps
 class CheckConfig:
     """Check a capture before a fit: prints a table and findings, and writes a contact sheet.
 
-    The table has a line per photograph: distances of camera and light from the object [radii of the object]; angle
-    between both [deg]; share of the photograph that shows the object; shares of the object that are clipped and dark;
-    brightness of the background relative to the object; brightness of the object for its light, relative to the other
-    photographs; share of the mask that the other masks confirm. On the contact sheet masks are outlined in red, invalid
-    pixels are yellow and the visual hull is green. The exit status is 1 if there is something to correct.
+    The table has a line per photograph with these numbers: distances of camera and light from the object [radii of the
+    object]; angle between camera and light, seen from the object [deg]; share of the photograph that shows the object;
+    shares of the object that are overexposed and dark; brightness of the background relative to the object; brightness
+    of the object relative to the other photographs, after division by the strength of the light; share of the mask that
+    the other masks confirm. On the contact sheet, masks have a red outline, invalid pixels are yellow and the visual
+    hull is green. The exit status is 1 if there is something to correct.
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file that names the photographs, their cameras and lights."""
     out: Path | None = None
-    """Contact sheet to write, a .png file with all photographs and masks. Without it: out/check/NAME.png.
-    NAME is the scene file without .xml. For a file pot/scene.xml the folder gives the name."""
+    """Contact sheet to write, a .png file with all photographs and masks. Without this option: out/check/NAME.png.
+    NAME is the name of the scene file without .xml: pot for pot.xml. It is pot for pot/scene.xml, too."""
     masks: Literal["auto", "given", "none"] = "auto"
     """The masks to check. Set none if the masks of the scene file are wrong and the background is dark.
-    given: the masks of the scene file. none: they are ignored; in a dark room the bright pixels are the mask.
+    given: the masks of the scene file. none: no masks of the file; in a dark room the bright pixels are the mask.
     auto: given if the scene file has masks, otherwise none."""
 
 

@@ -1,4 +1,4 @@
-"""What image files say about their colours: ICC profiles, chunks of PNG, primaries of OpenEXR."""
+"""Converts pixels from the colour space that an image file declares to sRGB or linear radiance."""
 
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -12,21 +12,25 @@ RELATIVE = 1  #: rendering intent: relative colorimetric
 
 
 class Statement(NamedTuple):
-    """The colour space that a file declares. If it declares none, 8-bit pixels are sRGB and all others are linear."""
+    """The colour space that an image file declares. Both fields are None if the file declares none.
+
+    Then 8-bit pixels are sRGB and all others are linear.
+    """
 
     profile: bytes | None = None  #: an ICC profile
     exponent: float | None = None  #: linear = encoded ^ exponent; 2.2 stands for sRGB's curve
 
 
 def srgb_to_linear(v: np.ndarray) -> np.ndarray:
-    """Decode sRGB values to linear ones (IEC 61966-2-1), float32."""
+    """Decode sRGB values of any shape to linear values, float32 (IEC 61966-2-1)."""
     return np.where(v <= 0.04045, v / 12.92, ((np.maximum(v, 0.04045) + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def primaries_profile(white: tuple, primaries: tuple, exponent: float = 1.0) -> bytes:
-    """Make the ICC profile of an RGB space: `white` (x, y), and `primaries` (x, y of red, green and blue).
+    """Make the ICC profile of an RGB colour space. Returns its bytes.
 
-    linear = encoded ^ `exponent`; 2.2 stands for sRGB's curve.
+    `white`: chromaticity (x, y) of white. `primaries`: x, y of red, of green and of blue, six numbers. `exponent`:
+    linear value = encoded value ^ exponent; 2.2 stands for sRGB's curve.
     """
     places = [value for k in range(3) for value in (*primaries[2 * k : 2 * k + 2], 1.0)]
     curve: dict[str, Any] = {"gamma": exponent}
@@ -47,9 +51,9 @@ CURVES = {1: 2.2, 2: 2.2, 4: 2.2, 5: 2.8, 6: 2.2, 8: 1.0, 13: 2.2, 14: 2.2, 15: 
 
 
 def coded_statement(primaries: int, curve: int) -> Statement:
-    """Convert ITU-T H.273 codes, as in PNG, HEIF and AVIF, to a colour space.
+    """Convert ITU-T H.273 codes to a colour space. PNG, HEIF and AVIF files contain such codes.
 
-    Raises ValueError for HDR and unknown codes.
+    `primaries`: code of the primaries. `curve`: code of the transfer curve. Raises ValueError for HDR or unknown codes.
     """
     if curve not in CURVES or primaries not in CODED:
         what = {16: "PQ, of HDR", 18: "HLG, of HDR"}.get(curve, f"{primaries}/{curve} by ITU-T H.273")
@@ -61,7 +65,7 @@ def coded_statement(primaries: int, curve: int) -> Statement:
 
 @lru_cache(maxsize=8)
 def is_usual(profile: bytes, linear: bool) -> bool:
-    """Test whether an ICC profile is that of sRGB or, with `linear`, of linear light with sRGB's primaries."""
+    """Test whether an ICC profile describes sRGB; with `linear`: linear radiance with sRGB's primaries."""
     axis = np.linspace(0, 1, 6, dtype=np.float32)
     colours = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(36, 6, 3)
     return bool(np.abs(transformed(colours, profile) - (colours if linear else srgb_to_linear(colours))).max() < 2e-3)
@@ -70,7 +74,8 @@ def is_usual(profile: bytes, linear: bool) -> bool:
 def transformed(colours: np.ndarray, profile: bytes) -> np.ndarray:
     """Convert encoded colours (H, W, 1 or 3) to linear radiance with sRGB's primaries, by an ICC profile.
 
-    Integers become uint16, all else float32. Raises ValueError if the profile is damaged, or neither RGB nor grey.
+    Returns uint16 for integers and float32 for floats. Raises ValueError if the profile is damaged, or if its colour
+    space is neither RGB nor grey.
     """
     if (space := SPACES.get(profile[16:20])) is None:
         raise ValueError(f"its colour profile is of {profile[16:20].decode('ascii', 'replace').strip()}, not of RGB or "
@@ -93,11 +98,11 @@ def transformed(colours: np.ndarray, profile: bytes) -> np.ndarray:
 
 
 def as_stated(pixels: np.ndarray, said: Statement) -> np.ndarray:
-    """Convert pixels (H, W, C) from the colour space that their file declares to the usual one.
+    """Convert pixels (H, W, C) from the colour space `said`, which their file declares.
 
-    Usual are sRGB for 8 bits, and linear radiance with sRGB's primaries for all others. Such pixels are returned as
-    they are. Others become linear: uint16 if they were integers, otherwise float32. Clipped pixels remain clipped.
-    Raises ValueError as `transformed` does.
+    8-bit sRGB pixels, and linear pixels of other types with sRGB's primaries, are returned unchanged. All other pixels
+    become linear with sRGB's primaries: uint16 if they were integers, float32 if they were floats. Clipped pixels
+    remain clipped. Raises the ValueError of `transformed`.
     """
     kind = pixels.dtype
     count = 3 if pixels.shape[2] > 2 else 1

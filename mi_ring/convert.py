@@ -21,7 +21,7 @@ Formats: Any = Union[  # noqa: UP007
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in FORMATS:
         if not (src := Path(arguments[0])).exists():
             raise InputError(f"FORMAT: is {src}; must be one of {', '.join(FORMATS)}, or SRC, a file or folder")

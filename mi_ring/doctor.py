@@ -31,7 +31,7 @@ class DoctorConfig:
 
 
 class Finding(NamedTuple):
-    """A line of the output."""
+    """One line of the output of mi-ring doctor."""
 
     mark: str  #: ok; MISSING: a fit cannot run; without: something else cannot run
     what: str
@@ -39,7 +39,7 @@ class Finding(NamedTuple):
 
 
 def findings() -> Iterator[Finding]:
-    """What is installed on this machine and what is missing."""
+    """Yield a finding for each package and library: is it installed, and if not, how to install it."""
     yield Finding("ok", "mi_ring", __version__)
     yield Finding("ok", "Python", f"{platform.python_version()} on {platform.platform()}")
     for package in ("torch", "drjit", "mitsuba"):
@@ -61,7 +61,7 @@ def findings() -> Iterator[Finding]:
 
 
 def computing() -> Iterator[Finding]:
-    """The cache folder, the processor and the GPU."""
+    """Yield findings about the cache folder, the processor and the GPU."""
     import drjit as dr
     import torch
 

@@ -23,12 +23,13 @@ MISPLACED = 0.3  #: below this IoU of the silhouettes the true mesh is probably 
 class EvaluateConfig:
     """Compare a finished fit with the truth. Prints a table to standard error and a line of JSON to standard output.
 
-    Pixels that see both surfaces: errors of normals [deg] and depths [% of the diagonal of the true bounding box].
-    Silhouettes: intersection over union. Visible faces: share that points away from the camera.
-    Surfaces, or their visible parts with --seen: Chamfer distance [% of the diagonal] and F-score.
-    Fitted mesh: genus, triangles that cross another, triangles that Shape-Net turned inside out.
-    Predicted photographs: PSNR [dB] and SSIM, of all pixels; of the object's pixels if there is a mask and a visible
-    background. The JSON file has the numbers of every photograph.
+    Normals and depths are compared at pixels that see both surfaces: errors [deg], and [% of the diagonal of the true
+    bounding box]. Silhouettes are compared by intersection over union. The table also has the share of visible faces
+    that point away from the camera. The surfaces are compared by Chamfer distance [% of the diagonal] and F-score; with
+    --seen, only their visible parts. The fitted mesh is described by its genus, the number of triangles that cross
+    another, and the number of triangles that Shape-Net turned inside out. Predicted photographs are compared by PSNR
+    [dB] and SSIM: for all pixels, and for the object's pixels if there is a mask and a visible background. The JSON
+    file has the numbers of every photograph.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -37,23 +38,23 @@ class EvaluateConfig:
     """PLY, OBJ or GLB file of the true surface, in the units and the frame of the scene.
     For a capture of mi-ring synthesize or mi-ring example it is truth/mesh.ply."""
     novel: Path | None = None
-    """Scene file of photographs that the fit has not used. Predictions of these photographs are compared with them.
-    Without it: only the photographs of the fit are compared."""
+    """Scene file of photographs that the fit has not used. The command predicts them and measures the errors.
+    Without this option: only the photographs of the fit are compared."""
     seen: bool = False
-    """Compute Chamfer distance and F-score only for parts of the surfaces that a photograph of the fit shows.
-    Use it if the photographs do not show the whole object, for example not its underside."""
+    """Compute Chamfer distance and F-score only for the parts of the surfaces that a photograph of the fit shows.
+    Use this option if the photographs do not show the whole object, for example if its underside is hidden."""
     align: Literal["rigid", "similarity"] | None = None
     """Align the true surface and the photographs of --novel with the fit before the comparison.
     rigid: by rotation and translation. similarity: also by scale. Results for the fit's own photographs do not change.
-    Use it after a fit with --refine cameras, in which the whole object may move."""
+    Use this option after a fit with --refine cameras: such a fit may move the whole object."""
     spp: int = SPP
     """Samples per pixel of the predicted photographs. More samples give less noise and take longer."""
     out: Path | None = None
-    """JSON file for the numbers. Without it: evaluation.json in the results folder."""
+    """JSON file for the numbers. Without this option: evaluation.json in the results folder."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(EvaluateConfig, arguments, "mi_ring.evaluate")
     require_range(config, "spp", 1)
     for name in ("scene.xml", "mesh.ply", "ring.pt"):

@@ -22,7 +22,7 @@ class ExampleConfig:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     folder = command.parse(ExampleConfig, arguments, "mi_ring.example").folder
     with writing(folder):
         here = folder.resolve() == Path.cwd()  # it cannot be replaced

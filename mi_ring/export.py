@@ -25,8 +25,8 @@ class ExportConfig(MaterialOptions):
 
     .ply: the mesh. Vertex attributes: the parameters of its BSDF, and whether a photograph shows the vertex.
     .glb: the mesh with a normal map and glTF's metallic-roughness material.
-    .obj: the same in OBJ, MTL and PNG files.
-    .xml: a Mitsuba scene with textures and Mitsuba's own BSDFs. It can be rendered without mi_ring.
+    .obj: the same content in OBJ, MTL and PNG files.
+    .xml: a Mitsuba scene with textures and Mitsuba's own BSDFs. Mitsuba renders it without mi_ring.
 
     Positions are in the units and the frame of the scene. In a GLB, a node converts them to metres and turns the object
     upright, if the capture gives the unit and the up direction.
@@ -38,8 +38,8 @@ class ExportConfig(MaterialOptions):
     """File to write. OBJ and XML need further files, which are written beside it."""
     subdivisions: int | None = None
     """Level of the mesh, which has about 10 · 4^level vertices. The highest level is 10 for .ply, 8 for other files.
-    Lower it for a smaller file, raise it for a finer mesh.
-    Without it: the level of the fit, but at most 5 for .glb, whose normal map has the finer detail."""
+    A lower level gives a smaller file, a higher level a finer mesh.
+    Without this option: the level of the fit, but at most 5 for .glb, whose normal map has the finer detail."""
     resolution: int = RESOLUTION
     """Width and height of the textures [texels], 64 to 4096. More texels keep finer detail and make larger files.
     A .ply has no textures."""
@@ -48,7 +48,7 @@ class ExportConfig(MaterialOptions):
     0.5: the surface after half of the deformation."""
     metres: float | None = None
     """Length of a scene unit [m], to give the object its real size. 0.001: the unit is the millimetre. Only for .glb.
-    Without it: the length that the capture gives. Captures of mi-ring photos with the printed sheet give it."""
+    Without this option: the length in the capture. Captures of mi-ring photos with the printed sheet have one."""
 
 
 def require_options(config: ExportConfig) -> None:
@@ -61,9 +61,9 @@ def require_options(config: ExportConfig) -> None:
 
 
 def seen_from(run: Path) -> list[MaskedCamera] | None:
-    """Read camera and mask of each photograph of a fit: `run` is its folder or a file in it.
+    """Read the camera and the mask of each photograph of a fit. `run`: the results folder of the fit, or a file in it.
 
-    Returns None, with a warning, if its scene.xml cannot be read.
+    Prints a warning and returns None if the scene.xml in this folder cannot be read.
     """
     try:
         return load_views((run if run.is_dir() else run.parent) / "scene.xml")
@@ -73,7 +73,7 @@ def seen_from(run: Path) -> list[MaskedCamera] | None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(ExportConfig, arguments, "mi_ring.export")
     require_options(config)
     ring = load_fit(config.run)

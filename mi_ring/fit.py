@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def run(arguments: Sequence[str], processes: Processes) -> int:
-    """Run the command in one of its `processes`."""
+    """Run the command in this process. Returns the exit status as `main`. `processes`: all processes of the fit."""
     started = time.monotonic()
     config, choice, state = processes.on_first(lambda: asked(arguments))
     folder = config.folder
@@ -71,7 +71,10 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
 
 
 def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fit:
-    """Start a new fit. Its time includes the coarse fits that find the kind of an unknown light."""
+    """Make a new fit, before its first iteration. If the light is unknown, coarse fits first find its kind.
+
+    The recorded time of the fit includes these coarse fits.
+    """
     began = time.perf_counter()
     lighting = processes.broadcast(processes.agreed(lambda: choose_lighting(capture, config)))
     seconds = time.perf_counter() - began
@@ -81,7 +84,11 @@ def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fi
 
 
 def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | None]:
-    """Read the arguments: options, the alternatives that --minutes chooses from, the checkpoint for --resume."""
+    """Read the arguments of the command line.
+
+    Returns (options; the alternatives that --minutes chooses from; with --resume the content of the checkpoint,
+    otherwise None).
+    """
     config = parse_options(arguments)
     choice = choice_of(config, arguments)
     require_scene(config.scene)
@@ -93,13 +100,17 @@ def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | 
 
 
 def same_variant(variant: str) -> None:
-    """Switch to the variant of the first process. Raises InputError if this process cannot use it."""
+    """Switch Mitsuba to `variant`, which the first process uses. Raises InputError if this process cannot use it."""
     if set_variant(variant) != variant:
         raise InputError(f"--variant {variant}: this process has no GPU to use; give llvm_ad_rgb")
 
 
 def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
-    """The configurations that --minutes chooses from: the given preset, or all presets that fit the other options."""
+    """List the configurations that --minutes chooses from.
+
+    They are one per preset that does not contradict the other options. If --preset or no --minutes is given, there is
+    only `config`. Raises InputError if --minutes and --iterations are both given.
+    """
     if config.minutes and given(arguments, "--iterations"):
         raise InputError("--minutes: chooses --iterations; give one of the two")
     choice = []
@@ -111,9 +122,10 @@ def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
 
 
 def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
-    """Choose the configuration of `choice` that --minutes allows. Also returns the measured costs of iterations.
+    """Choose the configuration of `choice` whose fit takes --minutes. Measures iterations of `fit` for this.
 
-    `started`: start of the command, by `time.monotonic`. Raises InputError if none can be done in that time.
+    Returns (configuration, measured costs of iterations). `started`: start time of the command, by `time.monotonic`.
+    Raises InputError if --minutes is too short for every configuration.
     """
     minutes, processes = choice[0].minutes, fit.problem.processes
     spent = processes.broadcast(time.monotonic() - started)
@@ -130,7 +142,11 @@ def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitC
 
 
 def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path) -> FitConfig:
-    """The configuration that --minutes chose when the fit was started, by config.json in the results folder."""
+    """Find the configuration that --minutes chose when the fit was started. Reads config.json in `folder`.
+
+    Without --minutes, or if config.json cannot be read, it returns `config`. Raises InputError if --minutes is not the
+    same as before.
+    """
     try:
         before = read_json(folder / "config.json")
         minutes, preset, iterations = float(before["minutes"]), before["preset"], int(before["iterations"])
@@ -146,7 +162,7 @@ def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path)
 
 
 def given(arguments: Sequence[str], option: str) -> bool:
-    """Whether an option is among the arguments."""
+    """Test whether `option`, such as --preset, is among the arguments."""
     return any(argument.split("=")[0] == option for argument in arguments)
 
 

@@ -1,4 +1,4 @@
-"""The options of `mi-ring fit`: the settings of `Config`, and input, output and computing resources."""
+"""The options of `mi-ring fit`: the settings in `Config`, and the input, output and computing resources in `Task`."""
 
 import argparse
 import dataclasses
@@ -23,13 +23,13 @@ MORE = sum(len(dataclasses.fields(part)) for part in GROUPS.values()) - 1 + len(
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Input, output and computing resources."""
+    """Options for the input, the output and the computing resources of a fit."""
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]
     """Mitsuba XML file that names the photographs, their cameras and lights."""
     out: Path | None = None
-    """Folder for the results. Without it: out/NAME.
-    NAME is the scene file without .xml: pot.xml gives out/pot. For a file pot/scene.xml the folder gives the name."""
+    """Folder for the results. Without this option: out/NAME.
+    NAME is the name of the scene file without .xml: pot.xml gives out/pot. pot/scene.xml gives out/pot, too."""
     resume: bool = False
     """Continue an interrupted fit from the checkpoint in its results folder. Give the same options as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
@@ -38,7 +38,8 @@ class Task:
     paper: the paper's own settings, seven hours."""
     minutes: float = 0
     """Time that the whole command may take, approximately [min], for example 10. 0: no limit.
-    The command measures the speed of this machine and sets --iterations. If you give no --preset, it sets that, too."""
+    The command measures the speed of this machine and then chooses --iterations. If you give no --preset, the command
+    chooses the preset, too."""
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
     """Where Mitsuba computes. llvm_ad_rgb: on the processor. cuda_ad_rgb: on an Nvidia GPU, which must be there."""
     threads: int = 0
@@ -47,7 +48,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig(Config, Task):
-    """Reconstruct an object: photographs in, a watertight mesh with a spatially varying material out."""
+    """Reconstruct an object from photographs as a watertight mesh with a spatially varying material."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,7 +63,7 @@ class FitConfig(Config, Task):
 
     @property
     def thread_count(self) -> int:
-        """Number of threads to compute with; 0: all."""
+        """Number of threads to compute with; 0: one per core."""
         return 1 if self.deterministic else self.threads
 
     @property
@@ -72,10 +73,10 @@ class FitConfig(Config, Task):
 
 
 def parse_options(arguments: Sequence[str]) -> FitConfig:
-    """Read the configuration: the preset's settings, changed by the options on the command line.
+    """Read the options of the command line. Options that are not given have the values of the preset.
 
-    Raises InputError for wrong options. After printing the help it raises SystemExit: --help shows the options that
-    users set, --help-all shows all options.
+    Raises InputError for wrong options. With --help or --help-all it prints the help and raises SystemExit: --help
+    shows the options that users set, --help-all shows all options.
     """
     early = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
     early.add_argument("--preset", nargs="?", default="default")
@@ -98,9 +99,10 @@ def parse_options(arguments: Sequence[str]) -> FitConfig:
 
 
 def command_line(brief: bool) -> tuple[Any, dict[str, Any]]:
-    """The dataclass that tyro parses, and the dataclasses nested in it by field, one for each group of `GROUPS`.
+    """Make the dataclass that tyro parses. A nested dataclass holds the options of each group in `GROUPS`.
 
-    Nested options keep their names: --levels, not --tuning.levels. With `brief`, tyro neither shows nor parses them.
+    Returns (dataclass, nested dataclasses by group name). Nested options keep their names: --levels, not
+    --tuning.levels. `brief`: tyro neither shows nor parses the nested options.
     """
     parts, nested, hidden = {}, {}, Suppress
     for name, group in GROUPS.items():
@@ -111,10 +113,10 @@ def command_line(brief: bool) -> tuple[Any, dict[str, Any]]:
 
 
 def dataclass_of(name: str, fields: dict[str, Any], *bases: type) -> Any:
-    """Make a frozen dataclass with these fields, by name, and those of its bases."""
+    """Make a frozen dataclass. `fields`: type of each field by name. It inherits the fields of `bases`."""
     return dataclasses.make_dataclass(name, fields.items(), bases=bases, frozen=True, kw_only=True)
 
 
 def built(kind: Any, values: dict[str, Any]) -> Any:
-    """Make an instance of the dataclass `kind`. `values` may have further names, which are ignored."""
+    """Make an instance of the dataclass `kind`. `values`: value of each field by name; other names are ignored."""
     return kind(**{f.name: values[f.name] for f in dataclasses.fields(kind)})

@@ -1,4 +1,4 @@
-"""Readers for files of other programs: a damaged file raises InputError and cannot exhaust the memory."""
+"""Helps to read files of other programs: a damaged file raises InputError and cannot exhaust the memory."""
 
 import contextlib
 import io
@@ -31,7 +31,10 @@ except (ImportError, OSError, ValueError):
 
 @contextlib.contextmanager
 def reading(where: Path | str, what: str) -> Iterator[None]:
-    """Turn every error of a reader, in this context, into an InputError: file `where`, expected content `what`."""
+    """Context manager that turns every error in its block into an InputError.
+
+    The message says: `where` cannot be read as `what`. `where`: the file. `what`: the expected content.
+    """
     try:
         yield
     except InputError:
@@ -52,10 +55,10 @@ def require_plausible_size(path: Path, size: int) -> None:
 
 
 def require_readable(read: str, path: Path, size: int, what: str) -> None:
-    """Raise InputError if a native reader crashes, hangs or exhausts the memory on a file.
+    """Raise InputError if a native reader fails, crashes, hangs or exhausts the memory on the file `path`.
 
-    Not even Ctrl-C stops a native reader that hangs, so a child process tries it first. `read`: Python code that calls
-    the reader, with the path in sys.argv[1]. `size`: number of bytes to read. `what`: the expected content.
+    A child process tries the reader, because Ctrl-C does not stop a native reader that hangs. `read`: Python code that
+    calls the reader; it finds the path in sys.argv[1]. `size`: number of bytes to read. `what`: the expected content.
     """
     try:
         trial = [sys.executable, "-c", LIMIT_MEMORY + read, str(path), str(2**31 + 40 * size)]
@@ -68,20 +71,20 @@ def require_readable(read: str, path: Path, size: int, what: str) -> None:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of a .npz file by name. Raises InputError if it cannot be read."""
+    """Read a .npz file. Returns its arrays by name. Raises InputError if the file cannot be read."""
     with reading(path, "arrays of NumPy's, .npz"), zipfile.ZipFile(path) as archive:
         require_plausible_size(path, sum(member.file_size for member in archive.infolist()))
         return {name.removesuffix(".npy"): parse_npy(archive.read(name)) for name in archive.namelist()}
 
 
 def load_npy(path: Path) -> np.ndarray:
-    """Read the array of a .npy file. Raises InputError if it cannot be read."""
+    """Read the array of a .npy file. Raises InputError if the file cannot be read."""
     with reading(path, "an array of NumPy's, .npy"):
         return parse_npy(path.read_bytes())
 
 
 def parse_npy(content: bytes) -> np.ndarray:
-    """The array in the content of a .npy file. Raises ValueError if the content is damaged."""
+    """Convert `content`, the bytes of a .npy file, to its array. Raises ValueError if the content is damaged."""
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

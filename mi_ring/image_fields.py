@@ -1,4 +1,4 @@
-"""The fields of image files, and what is done with each. `convert` names those that are not used."""
+"""The metadata fields of image files, and how mi_ring treats each. `mi-ring convert` names fields that are not used."""
 
 from pathlib import Path
 
@@ -94,9 +94,9 @@ FIELDS = {
 
 
 def field_names(path: Path) -> tuple[str, list[str]]:
-    """Return (file kind, a key of `FIELDS`; names of the metadata fields) of an image file.
+    """Read the names of the metadata fields of an image file. Returns (kind of file, names).
 
-    Raises as `open_image` does.
+    The kind is a key of `FIELDS`. Raises the errors of `open_image`.
     """
     suffix = path.suffix.lower()
     if suffix == ".exr":
@@ -119,7 +119,10 @@ def field_names(path: Path) -> tuple[str, list[str]]:
 
 
 def unused_fields(path: Path) -> dict[str, str]:
-    """Find metadata fields of an image file that are not used but may matter: reason, or "unknown", by name."""
+    """Find metadata fields of an image file that mi_ring does not use although they may matter.
+
+    Returns by name the reason why the field is not used, or "unknown". Raises the errors of `open_image`.
+    """
     kind, names = field_names(path)
     found = FIELDS[kind].unused(names)
     if kind == "TIFF" and "InterColorProfile" in names:

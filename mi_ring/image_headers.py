@@ -1,4 +1,4 @@
-"""What the headers of image files say: format, size, depth, EXIF data, colours; before pixels are read."""
+"""Reads the headers of image files, without the pixels: format, size, bit depth, EXIF data and colour space."""
 
 import contextlib
 import io
@@ -46,7 +46,10 @@ Image.MAX_IMAGE_PIXELS = None
 
 
 class BoundedFile(io.BufferedReader):
-    """A file whose `read` never allocates more than the remaining bytes, even if a damaged header requests more."""
+    """A binary file whose `read` never allocates more memory than the rest of the file, however much is requested.
+
+    Damaged headers may request any amount.
+    """
 
     def read(self, size: int | None = -1, /) -> bytes:
         left = max(0, os.fstat(self.fileno()).st_size - self.tell())
@@ -55,10 +58,10 @@ class BoundedFile(io.BufferedReader):
 
 @contextlib.contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """Context manager that opens an image file with Pillow.
+    """Context manager that opens an image file with Pillow, without reading its pixels.
 
-    Raises ValueError if it is no image or declares an implausible size, InputError for HEIF if pillow_heif is not
-    installed, and other errors if the file is damaged.
+    Raises ValueError if the file is no image or declares an implausible size. Raises InputError for a HEIF file if the
+    package pillow_heif is not installed. A damaged file raises errors of other types.
     """
     if path.suffix.lower() in HEIF:
         need("pillow_heif", f"{path}").register_heif_opener()
@@ -76,7 +79,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def exif_of(path: Path) -> Image.Exif:
-    """Read the EXIF data of an image file; empty if it has none. Raises as `open_image` does."""
+    """Read the EXIF data of an image file. They are empty if the file has none. Raises the errors of `open_image`."""
     suffix, exif = path.suffix.lower(), Image.Exif()
     if suffix in (*TIFF, *RAW):  # Pillow does not open all of their pixels
         trouble = () if suffix in TIFF else (Exception,)  # of raw files that are no TIFFs
@@ -92,7 +95,7 @@ def exif_of(path: Path) -> Image.Exif:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Read (width, height) [px] from the header of an image file. Raises as `open_image` does."""
+    """Read (width, height) [px] from the header of an image file, as stored. Raises the errors of `open_image`."""
     suffix = path.suffix.lower()
     if suffix == ".exr":
         return exr_size(path)[:2]
@@ -107,7 +110,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def has_alpha_channel(path: Path) -> bool:
-    """Test whether an image file has an alpha channel. Raises as `open_image` does."""
+    """Test whether an image file has an alpha channel. Raises the errors of `open_image`."""
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg", *RAW):
         return False
@@ -122,10 +125,10 @@ def has_alpha_channel(path: Path) -> bool:
 
 
 def statement_of(path: Path) -> Statement:
-    """Read the colour space that an image file declares. Raises as `open_image` does.
+    """Read the colour space that an image file declares. Raises the errors of `open_image`.
 
-    If there are several declarations, the first of these counts: PNG's cICP chunk, ICC profile, HEIF and AVIF codes,
-    other PNG chunks, Adobe RGB in EXIF.
+    A file may declare several. Then the first in this list counts: PNG chunk cICP, ICC profile, codes of HEIF and AVIF,
+    other PNG chunks, Adobe RGB in EXIF data.
     """
     suffix = path.suffix.lower()
     if suffix == ".exr":
@@ -156,7 +159,10 @@ def statement_of(path: Path) -> Statement:
 
 
 def png_statement(info: dict, bits: int) -> Statement:
-    """Read the colour space from the PNG chunks sRGB, gAMA and cHRM. `info`: metadata as Pillow reads it."""
+    """Convert the PNG chunks sRGB, gAMA and cHRM to a colour space.
+
+    `info`: the metadata that Pillow has read from the file. `bits`: bits per channel.
+    """
     if "srgb" in info:
         return Statement(None, 2.2)
     gamma, places = info.get("gamma"), info.get("chromaticity")
@@ -168,7 +174,7 @@ def png_statement(info: dict, bits: int) -> Statement:
 
 
 def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield (name, content) of each chunk before the pixels of a PNG file. Content is cut off after 64 bytes."""
+    """Yield (name, content) of each chunk of a PNG file that precedes the pixels, at most 64 bytes of the content."""
     with path.open("rb") as file:
         file.seek(8)
         while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
@@ -178,7 +184,7 @@ def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
 
 
 def bits_of(path: Path) -> int:
-    """Read the bits per channel of an image file: 8, 16, or 32 for floats. Raises as `open_image` does."""
+    """Return the bits per channel of an image file: 8, 16, or 32 for floats. Raises an error if the file is damaged."""
     suffix = path.suffix.lower()
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:
@@ -192,7 +198,7 @@ def bits_of(path: Path) -> int:
 
 
 def encodings(paths: Sequence[Path]) -> list[str]:
-    """Describe the pixel encodings of image files, one clause for each encoding."""
+    """Return clauses for the user that say how many of the files have which encoding: sRGB, linear, or declared."""
     bits = Counter(bits_of(path) for path in paths)
     said = sum(statement_of(path) != Statement() for path in paths)
     kinds = {8: "8 bits are sRGB", 16: "16 bits are linear", 32: "floats are linear"}
@@ -201,17 +207,17 @@ def encodings(paths: Sequence[Path]) -> list[str]:
 
 
 def encoding_of(path: Path) -> Literal["srgb", "linear"]:
-    """Encoding of the pixels that `read_image` returns for this file with `heed`."""
+    """Return the encoding of the pixels that `read_image(path, heed=True)` returns: "srgb" or "linear"."""
     said = statement_of(path)
     sample = np.zeros((1, 1, 3), np.uint8)
     return "srgb" if bits_of(path) == 8 and as_stated(sample, said).dtype == np.uint8 else "linear"
 
 
 def exr_attributes(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield (name, value) of each header attribute of an OpenEXR file. Values are cut off after 64 KiB.
+    """Yield (name, value) of each header attribute of an OpenEXR file, at most 64 KiB of the value.
 
-    Format ("OpenEXR File Layout"): name and type, each ended by a zero byte; size; value. Raises ValueError if the file
-    is no OpenEXR file or has several parts.
+    The format is described in "OpenEXR File Layout": an attribute consists of its name, its type, its size and its
+    value; a zero byte ends the name and the type. Raises ValueError if it is no OpenEXR file or has several parts.
     """
     with path.open("rb") as file:
 
@@ -231,7 +237,10 @@ def exr_attributes(path: Path) -> Iterator[tuple[bytes, bytes]]:
 
 
 def exr_channels(value: bytes) -> list[str]:
-    """Parse the value of the attribute `channels`: channel names, each followed by a zero byte and 16 more bytes."""
+    """Read the channel names from `value`, the bytes of the OpenEXR attribute `channels`.
+
+    A zero byte and 16 more bytes follow each name.
+    """
     names, place = [], 0
     while value[place]:
         end = value.index(b"\0", place)
@@ -241,10 +250,10 @@ def exr_channels(value: bytes) -> list[str]:
 
 
 def exr_picture(names: Sequence[str]) -> list[str]:
-    """Choose the channels that form the picture: R, G, B and A; or Y and A; or the only channel.
+    """Choose the channels of an OpenEXR file that form the picture: R, G, B and A; or Y and A; or the only channel.
 
-    Names may begin with a layer, as in `ViewLayer.Combined.R`, if only one layer has R, G and B. Raises ValueError if
-    no channels form a picture, or if several layers do.
+    `names`: all channel names. A name may begin with a layer, as in `ViewLayer.Combined.R`. Raises ValueError if no
+    channels form a picture, or if several layers do.
     """
     layers = [name.removesuffix("R") for name in names if name == "R" or name.endswith(".R")]
     layers = [layer for layer in layers if {f"{layer}{c}" for c in "RGB"} <= {*names}]
@@ -261,7 +270,7 @@ def exr_picture(names: Sequence[str]) -> list[str]:
 def exr_size(path: Path) -> tuple[int, int, int]:
     """Read (width [px], height [px], number of channels) from the header of an OpenEXR file.
 
-    Raises ValueError if the file has no pixels, or only a part of the picture's pixels.
+    Raises ValueError if the file contains no pixels, or only a part of the picture.
     """
     found = dict(exr_attributes(path))
     left, top, right, bottom = data = struct.unpack("<4i", found[b"dataWindow"])

@@ -1,4 +1,4 @@
-"""Images as arrays: sRGB, box filter, Gaussian blur, and image files of any bit depth."""
+"""Images as arrays: the sRGB curve, filters, and functions that read and write image files of any bit depth."""
 
 import contextlib
 import io
@@ -28,15 +28,16 @@ Pictures = TypeVar("Pictures", np.ndarray, Tensor)
 
 
 def linear_to_srgb(v: np.ndarray) -> np.ndarray:
-    """Encode linear values as sRGB values. They are first clipped to [0, 1]."""
+    """Clip linear values of any shape to [0, 1] and encode them as sRGB values in [0, 1]."""
     v = np.clip(v, 0, 1)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def contrasted(linear: Pictures, contrast: Any) -> Pictures:
-    """Apply an S-curve, like that of film, to linear values. Values of at least 1 do not change.
+    """Apply an S-curve, like the curve of film, to linear values of any shape. Values of at least 1 do not change.
 
-    It maps an sRGB value v to vᶜ / (vᶜ + (1 − v)ᶜ), where c is `contrast`. The inverse is the curve with 1 / c.
+    In terms of the sRGB value v, the curve is vᶜ / (vᶜ + (1 − v)ᶜ), where c is `contrast`. The curve with contrast
+    1 / c is the inverse. Returns linear values.
     """
     where: Any = torch.where if isinstance(linear, Tensor) else np.where
     x = linear.clip(1e-6, 1 - 1e-6)  # so that the powers have finite derivatives
@@ -48,7 +49,7 @@ def contrasted(linear: Pictures, contrast: Any) -> Pictures:
 
 
 def to_bytes(encoded: np.ndarray) -> np.ndarray:
-    """Convert values in [0, 1] to uint8 in 0 to 255. Values outside are clipped."""
+    """Convert values from [0, 1] to uint8 values from 0 to 255. Values outside of [0, 1] are clipped."""
     return (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -62,11 +63,11 @@ def box_filter(image: Tensor, scale: int) -> Tensor:
 def read_image(path: Path, heed: bool = False) -> np.ndarray:
     """Read the pixels (H, W, C) of an image file: uint8, uint16 or float32. Raw files become linear uint16.
 
-    `heed`: convert pixels by the colour space that the file declares, so that 8 bits are sRGB and all others linear;
-    see `colour_profiles.as_stated`. Without it: pixels as stored.
+    `heed`: apply the colour space that the file declares: the result is sRGB if it is uint8, otherwise linear; see
+    `colour_profiles.as_stated`. If it is false, the pixels are returned as they are stored.
 
-    Raises ValueError for CMYK, for integers of more than 16 bits, for several parts and for an implausible size, before
-    memory is allocated; other errors for damaged files.
+    Raises ValueError for CMYK, for integers of more than 16 bits, for files of several pictures and for an implausible
+    size. It checks the size before it allocates memory. Damaged files raise errors of other types.
     """
     suffix = path.suffix.lower()
     if suffix in TIFF:
@@ -92,7 +93,7 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
 
 
 def read_tiff(path: Path) -> np.ndarray:
-    """Read the pixels (H, W, C) of the first page of a TIFF file. Raises ValueError as `read_image` does."""
+    """Read the pixels (H, W, C) of the first page of a TIFF file. Raises the errors of `read_image`."""
     kinds = tifffile.PHOTOMETRIC
     with tifffile.TiffFile(path) as file:
         page = file.pages.first
@@ -130,7 +131,10 @@ def read_tiff(path: Path) -> np.ndarray:
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """Read the channels of an OpenEXR file that `exr_picture` chooses: (H, W, C) float32."""
+    """Read the picture in an OpenEXR file: (H, W, C) float32. `exr_picture` chooses the channels.
+
+    Raises ValueError for an implausible size, and the errors of `exr_picture` and `exr_size`.
+    """
     width, height, channels = exr_size(path)
     require_plausible_size(path, 4 * width * max(height, EXR_CHUNK) * channels)
     with exr_threads():
@@ -142,16 +146,19 @@ def read_exr(path: Path) -> np.ndarray:
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Develop a raw file to linear radiance with sRGB's primaries and the camera's white balance: (H, W, 3) uint16."""
+    """Develop a raw file to linear radiance (H, W, 3) uint16, with sRGB's primaries and the camera's white balance.
+
+    Raises InputError if the package rawpy is not installed, ValueError for an implausible size.
+    """
     with need("rawpy", f"{path}").imread(str(path)) as raw:
         require_plausible_size(path, 6 * raw.sizes.raw_width * raw.sizes.raw_height)
         return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
 
 
 def mask_values(pixels: np.ndarray) -> np.ndarray:
-    """Take the mask (H, W) uint8 from the pixels (H, W, C) of its file.
+    """Convert the pixels (H, W, C) of a mask file to the mask (H, W) uint8, from 0 to 255.
 
-    It is the alpha channel if that is not constant, otherwise the first channel.
+    The mask is the alpha channel if there is one and it is not constant, otherwise the first channel.
     """
     channel = pixels[..., 0]
     if pixels.shape[2] in (2, 4) and pixels[..., -1].min() < pixels[..., -1].max():
@@ -161,19 +168,26 @@ def mask_values(pixels: np.ndarray) -> np.ndarray:
 
 
 def orientation_axes(orientation: int) -> np.ndarray:
-    """Matrix (3, 3) from the axes of stored pixels (x right, y down, z forward) to those after an EXIF orientation."""
+    """Return the matrix (3, 3) that an EXIF `orientation` (1 to 8) applies to directions.
+
+    It maps a direction in the axes of the stored image to the axes of the upright image. Both have x right, y down, z
+    forward.
+    """
     column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
     return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
 
 
 def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Rotate or mirror pixels (H, W, …) upright, by an EXIF orientation."""
+    """Rotate or mirror pixels (H, W, …) so that the image is upright. `orientation`: from EXIF data, 1 to 8."""
     column, row = orientation_axes(orientation)[:2, :2].sum(1).astype(int)
     return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation > 4 else pixels)[::row, ::column])
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Blur images (..., H, W) with a Gaussian of standard deviation `sigma` > 0 [px]. Outside, pixels count as zero."""
+    """Blur images (..., H, W) with a Gaussian of standard deviation `sigma` > 0 [px].
+
+    Pixels outside of the image count as zero.
+    """
     radius = int(3 * sigma + 0.5)
     total = sum(math.exp(-0.5 * (x / sigma) ** 2) for x in range(-radius, radius + 1))
 
@@ -185,7 +199,7 @@ def blur(images: Tensor, sigma: float) -> Tensor:
 
 
 def write_image(pixels: np.ndarray, path: Path) -> None:
-    """Write an image (H, W, C) in the format of the path's suffix: .png, .exr, otherwise JPEG."""
+    """Write an image (H, W, C) to a file. The suffix of `path` chooses the format: .png, .exr, otherwise JPEG."""
     formats = mi.Bitmap.FileFormat
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
     stream = mi.MemoryStream()
@@ -195,7 +209,7 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
 
 
 def encoded_picture(picture: Image.Image, kind: str = "PNG", **options: Any) -> bytes:
-    """Encode a Pillow image as the bytes of a file. `kind`: its format; `options`: those of Pillow's `save`."""
+    """Encode a Pillow image in the file format `kind`. Returns the bytes. `options`: options of Pillow's `save`."""
     buffer = io.BytesIO()
     picture.save(buffer, kind, **options)
     return buffer.getvalue()

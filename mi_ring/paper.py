@@ -41,23 +41,25 @@ class PaperConfig:
     data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA")]] = ()
     """Captures (folders with scene.xml and truth/mesh.ply) or meshes. specularity and stripes take one mesh.
     table2 takes the folder of DiLiGenT-MV, single takes .npz files.
-    Without data, the other experiments use the pot2 of a checkout or the pot of mi-ring example."""
+    Without DATA, the other experiments use the capture pot2 of the source repository. If it is not there, they use the
+    pot of mi-ring example."""
     materials: tuple[str, ...] = ()
     """Materials of the meshes, for example "principled roughness=0.3"; mi-ring synthesize --help lists all forms.
-    The first mesh gets the first material, the second the second, and so on; then again from the first.
-    specularity puts each material on its one mesh, stripes needs two."""
+    The first mesh gets the first material, the second mesh the second material, and so on. If there are more meshes
+    than materials, the list of materials is repeated.
+    specularity gives its one mesh each of the materials in turn. stripes needs two materials."""
     out: Path = Path("out/paper")
     """Folder for the results of all experiments and for the captures that they make.
     Each experiment has a folder of its name and preset."""
     preset: Literal["fast", "default", "fine", "paper"] | None = None
     """Preset of the fits, as in mi-ring fit: finer presets take longer.
-    Without it: default, or fast with --quick, which allows no other."""
+    Without this option: default. With --quick it is fast, and no other preset is allowed."""
     seeds: tuple[int, ...] = (0,)
-    """Random seeds, for example 0 1 2. Each run is made once with each seed, and the table has the means.
-    More seeds give surer means and take longer."""
+    """Random seeds, for example 0 1 2. Each run is made once with each seed. The table contains the means.
+    With more seeds the means vary less by chance, and the experiment takes longer."""
     only: tuple[str, ...] = ()
-    """Names of the runs to make now. The others can be made later or on other machines.
-    To see all names, give a wrong one. Without it: all runs."""
+    """Names of the runs to make now. You can make the other runs later or on other machines.
+    To see all names, give a wrong name. Without this option: all runs."""
     quick: bool = False
     """Make a small version in minutes: few runs, few iterations, small photographs.
     Its results are in OUT/NAME-quick."""

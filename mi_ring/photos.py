@@ -1,4 +1,4 @@
-"""From a folder of photographs to a capture to fit: `python -m mi_ring.photos FOLDER DIR`."""
+"""Make a capture from a folder of photographs: `python -m mi_ring.photos FOLDER DIR`."""
 
 import json
 import os
@@ -51,22 +51,24 @@ STEPS = (
 class PhotosConfig:
     """Find cameras and masks of photographs of an object, and write a capture to fit.
 
-    The photographs show one object, which does not move, from all around. A flash beside the lens lights it in a dim
-    room. They are JPEG, HEIC, PNG, TIFF, WebP, AVIF, BMP, OpenEXR or raw files. With a sheet of `mi-ring board` under
-    the object, the capture is in millimetres and upright. After an interruption the same command continues.
+    The photographs show one object from all around. The object does not move. A flash beside the lens lights the object
+    in a dim room. The files are JPEG, HEIC, PNG, TIFF, WebP, AVIF, BMP, OpenEXR or raw. With a sheet of `mi-ring board`
+    under the object, the capture is in millimetres and upright. After an interruption, give the same command again: it
+    continues.
     """
 
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]
     """Folder of the photographs."""
     out: Positional[Annotated[Path, arg(metavar="DIR")]]
     """Folder to write: scene.xml, its files, and work/ with intermediate results.
-    If the command is interrupted, it continues from work/."""
+    After an interruption, give the same command again: it continues from work/."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of the flash relative to the lens: right, down, forward. 30 -60 0: 30 to the right and 60 above it [mm].
-    The command refines it by the printed sheet. Without a sheet the unit is the median distance from camera to object.
-    Measure while you hold the camera as in most photographs. For the others the command turns it with the camera."""
+    """Position of the flash relative to the lens: right, down, forward. 30 -60 0: 30 mm to the right, 60 mm above.
+    The unit is the millimetre. If there is no printed sheet, it is the median distance from the cameras to the object.
+    Measure while you hold the camera as in most photographs. For photographs with the camera on its side, the command
+    turns the flash with the camera. If the photographs show the printed sheet, the command refines the position."""
     turntable: bool = False
-    """Set it if the object turned on a turntable while camera and flash stood still.
+    """Set this option if the object turned on a turntable while camera and flash stood still.
     The printed sheet of `mi-ring board` must lie under the object and turn with it."""
     masks: Literal["auto", "alpha", "rembg"] | Path = "auto"
     """Where the masks of the object come from. Give another source if the masks of auto are wrong.
@@ -75,11 +77,11 @@ class PhotosConfig:
     A folder: the masks in it. The mask of photo.jpg is photo.jpg.png, photo.png or photo.jpg."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box around the object [mm]: XLOW XHIGH YLOW YHIGH ZLOW ZHIGH, for example -40 40 -40 40 0 120.
-    The origin is the middle of the sheet. x points to its right edge, y to its top edge, z out of the paper.
-    Give it if the masks contain another thing, because it touches the object in the photographs."""
+    The masks then show only what is inside this box. Give a box if the masks also show a second thing near the object.
+    The origin is the middle of the printed sheet. x points to the right edge of the sheet, y to its top edge, z up."""
     square_mm: float = SQUARE
-    """Side of a square of the printed sheet [mm].
-    Give it if the printer did not print at 100 %: if five squares together measure 99 mm, give 19.8."""
+    """Side of a square on the printed sheet [mm].
+    Measure the sheet if the printer did not print at 100 %. If five squares together are 99 mm long, give 19.8."""
 
     def __post_init__(self) -> None:
         if not 0 < self.square_mm < np.inf:
@@ -92,12 +94,12 @@ class PhotosConfig:
             need("rembg", "--masks rembg")
 
     def words(self) -> list[str]:
-        """The options as strings, to recognise the same command."""
+        """List all options as strings. They are stored to recognise the same command later."""
         return [f"{name}: {v.resolve() if isinstance(v, Path) else v}" for name, v in vars(self).items()]
 
 
 def cameras_report(sparse: SparseModel) -> str:
-    """Describe the cameras in a line, and each photograph without a camera in a line."""
+    """Return a text for the user: one line about all cameras, and one line per photograph without a camera."""
     count, failed = len(sparse.cameras), sparse.failed
     how = f"as given by {sparse.source}" if sparse.source else f"by {len(sparse.points)} points"
     how += f", reprojection error {sparse.error:.2f} px" if sparse.error else ""
@@ -108,7 +110,10 @@ def cameras_report(sparse: SparseModel) -> str:
 
 
 def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path) -> str:
-    """Describe the masks in a line, and each photograph without a mask in a line. `source`: `PhotosConfig.masks`."""
+    """Return a text for the user: one line about all masks, and one line per photograph without a mask.
+
+    `source`: the value of `PhotosConfig.masks`.
+    """
     without = [name for name in sparse.cameras if name not in found.masks]
     why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
     return "\n".join([
@@ -118,7 +123,7 @@ def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path
 
 
 def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedObject) -> str:
-    """Describe the flash, the room's light and the camera's response in a line."""
+    """Return one line for the user about the flash, the room's light and the camera's response."""
     x, y, z = flash.offset
     where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
@@ -130,7 +135,7 @@ def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedO
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
@@ -161,7 +166,7 @@ def require_apart(config: PhotosConfig) -> None:
 
 
 def make(config: PhotosConfig, scene: Path) -> None:
-    """Make the capture and write it as `scene`. Stages with results in work/ are not repeated."""
+    """Make the capture and write it: the file `scene` and images. Stages with results in work/ are not repeated."""
     pictures = folder.find_pictures(config.folder, upright=detect(config.folder) is None)
     if dark := folder.without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")

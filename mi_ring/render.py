@@ -20,7 +20,7 @@ from mi_ring.system.files import writing
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(RenderConfig, arguments, "mi_ring.render")
     require_options(config)
     ring = load_fit(config.run)
@@ -78,7 +78,7 @@ def require_options(config: RenderConfig) -> None:
 
 
 def require_writable(views: list[RenderedView], capture: Capture, config: RenderConfig) -> None:
-    """Raise InputError if pictures cannot be written, or would overwrite each other or the photographs."""
+    """Raise InputError if the pictures cannot be written, or if they would overwrite each other or photographs."""
     if config.film:
         sizes = sorted({view.shot.size for view in views})
         if len(sizes) > 1:

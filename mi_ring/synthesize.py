@@ -9,7 +9,7 @@ from mi_ring.system.files import locked
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
+    """Run the command with these arguments of the command line."""
     config = command.parse(SynthesizeConfig, arguments, "mi_ring.synthesize")
     require_options(config)
     with locked(config.out, "OUT"):

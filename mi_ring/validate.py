@@ -24,23 +24,23 @@ class ValidateConfig:
     """Compare `photometric` with Mitsuba's path tracer on every photograph.
 
     Prints a line for each photograph and one for all. Numbers are in % of the path tracer's mean radiance:
-    difference: mean difference. absolute: mean absolute difference. noise: part of it that Monte Carlo noise explains.
-    shadows: light that shadows remove. interreflection: light that interreflection adds.
+    difference: mean difference. absolute: mean absolute difference. noise: the part of `absolute` that Monte Carlo
+    noise explains. shadows: light that shadows remove. interreflection: light that interreflection adds.
     unexplained: difference of direct light.
-    p direct: probability of so large a difference if the direct light of both renderers is the same.
-    p path: the same for all light of the path tracer; tiny if there is interreflection.
+    p direct: probability of a difference as large as this if the direct light of both renderers is the same.
+    p path: this probability for all light of the path tracer. It is tiny if there is interreflection.
 
-    Writes validate.png, a contact sheet, and validate.json, all numbers. The exit status is 1 if the direct light
-    differs by more than Monte Carlo noise, and 2 if there is nothing to compare.
+    The command writes a contact sheet, validate.png, and all numbers, validate.json. The exit status is 1 if the direct
+    light differs by more than Monte Carlo noise. It is 2 if there is nothing to compare.
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml|RUN")]]
     """Mitsuba XML file that names the photographs, or results folder of a fit."""
     out: Path | None = None
-    """Folder for the results. Without it: RUN/validate, or out/validate/NAME for a scene file.
-    NAME is the scene file without .xml. For a file pot/scene.xml the folder gives the name."""
+    """Folder for the results. Without this option: RUN/validate, or out/validate/NAME for a scene file.
+    NAME is the name of the scene file without .xml: pot for pot.xml. It is pot for pot/scene.xml, too."""
     photographs: tuple[str, ...] = ()
-    """Photographs to compare, by id or image name in the scene file, for example 003.jpg. Without it: all."""
+    """Photographs to compare, by id or image name in the scene file, for example 003.jpg. Without this option: all."""
     width: int = 128
     """Largest width and height of the pictures [px]. Larger pictures take longer and show smaller details."""
     spp: int = 64
@@ -49,10 +49,10 @@ class ValidateConfig:
     """Largest length of the path tracer's light paths, Mitsuba's max_depth: 3 or more. -1: no limit.
     Longer paths find more interreflection and take longer. With 2 there would be direct light only."""
     significance: float = 0.01
-    """Probability that the command reports a difference by chance although both renderers agree, above 0 and below 1.
-    0.01: once in a hundred runs. A smaller number misses more small differences."""
+    """Probability of a false alarm: the command reports a difference although both renderers agree. Between 0 and 1.
+    0.01: once in a hundred runs. With a smaller number the command misses more small differences."""
     seed: int = 0
-    """Random seed of all samples. Another seed shows whether a reported difference is chance."""
+    """Random seed of all samples. Give another seed to see whether a reported difference was only chance."""
 
     def __post_init__(self) -> None:
         for name in ("width", "spp"):
@@ -65,7 +65,10 @@ class ValidateConfig:
 
 
 def chosen_photographs(shots: Sequence[Shot], names: Sequence[str]) -> list[int]:
-    """Indices of the photographs with these ids or image names, by default all. Raises InputError."""
+    """Return the indices of the photographs with these ids or image names; without `names`, of all photographs.
+
+    Raises InputError for a name that no photograph has.
+    """
     for name in names:
         if not any(name in (shot.name, shot.file_name) for shot in shots):
             raise InputError(f"--photographs: there is no {name}; the first is called {shots[0].name}")

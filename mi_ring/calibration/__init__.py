@@ -1,4 +1,4 @@
-"""Calibration as something to be refined: the unknowns of cameras and lights, their values, and the room's light.
+"""Calibration that a fit refines: the unknowns of cameras and lights, their values, and the light of the room.
 
 May import: numpy, torch; images, capture, rendering, scene, geometry, system.
 """

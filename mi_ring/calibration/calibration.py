@@ -1,8 +1,8 @@
-"""Calibration as a fit refines it: the unknowns of cameras and lights with their values, and the light of the room.
+"""The calibration that a fit refines: the unknowns of cameras and lights with their values, and the room's light.
 
-The paper refines calibration together with the shape (its Table 3). Room light that is the same from all sides has no
-axes of its own: it counts as fixed in the world. Room light fixed in the camera looks like a flash elsewhere, or like
-another reflectance. It is refined only if the scene has some.
+The paper refines calibration together with the shape (its Table 3). Room light that is the same from all sides counts
+as fixed in the world. Room light that is fixed in the camera has an effect like a flash elsewhere or another
+reflectance. So it is refined only if the scene has such light.
 """
 
 import math
@@ -37,15 +37,18 @@ ROOM_START = 0.15  #: progress of a fit at which refinement of the room's light 
 
 
 class Calibration(nn.Module):
-    """The unknowns of calibration as parameters, in standard deviations of their priors; 0: the capture's value."""
+    """The unknowns of calibration as trainable parameters. 0 is the capture's value.
+
+    The unit of each parameter is the standard deviation of its prior.
+    """
 
     def __init__(
         self, capture: Capture, refined: Sequence[str], rig: Rig, frames: Collection[str] = ("world",)
     ) -> None:
-        """Start from the capture: every unknown is 0.
+        """Start from the values of the capture: every unknown is 0.
 
-        `refined`: options of `--refine` whose unknowns are refined. `rig`: cameras and lights of the capture. `frames`:
-        axes ("world", "camera") in which the room's light is fixed.
+        `refined`: the options of `--refine` that are refined. `rig`: cameras and lights of the capture. `frames`: the
+        axes in which the room's light is fixed, "world" or "camera" or both.
 
         Raises InputError if `falloff` is refined without a flash that moves with the camera.
         """
@@ -75,12 +78,12 @@ class Calibration(nn.Module):
         return now
 
     def forward(self, scale: int = 1) -> Views:
-        """Return the current cameras and lights for photographs that are `scale` times smaller."""
+        """Return the current cameras and lights of all photographs. `scale`: how many times smaller pictures are."""
         views = self.rig.views_of(self.estimate())
         return views if scale == 1 else views._replace(intrinsics=views.intrinsics / scale)
 
     def lamps(self) -> LightTensors:
-        """Return the current lamps of the scene."""
+        """Return the lamps of the scene with their current places and strengths."""
         return self.rig.lamps_of(self.estimate())
 
     def lamp_tensors(self) -> list[Tensor]:
@@ -91,9 +94,9 @@ class Calibration(nn.Module):
         return [now.places.to(device()), now.strengths.to(device())]
 
     def solves_room(self, progress: float) -> bool:
-        """Test whether the fit estimates the room's light at this progress (0 to 1).
+        """Test whether the fit estimates the room's light at this `progress`, 0 to 1.
 
-        Without other light it always does.
+        If there is no other light, the fit estimates the room's light from the start.
         """
         return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
 
@@ -105,26 +108,26 @@ class Calibration(nn.Module):
 
     @property
     def albedo_factor(self) -> float:
-        """Factor of the albedo that keeps directly lit surfaces equally bright when the unknown `scale` changes."""
+        """Factor of the albedo: with it, a change of the unknown `scale` does not change directly lit surfaces."""
         return math.exp(-float(self.value("scale").detach()))
 
     @property
     def power_factor(self) -> float:
-        """Common factor of all light strengths that the fit has estimated."""
+        """Common factor of the strengths of all lights, as estimated so far."""
         return self.rig.power / self.albedo_factor
 
     def indirect(self, light: Tensor) -> Tensor:
-        """Give interreflection `light` (n, H, W, 3) a gradient for the unknown `scale`; its values do not change.
+        """Attach interreflection `light` (n, H, W, 3) to the unknown `scale`. Returns the same values with a gradient.
 
-        Stronger lights mean a darker surface, and each bounce after the first loses one factor of the albedo.
+        If the lights are stronger, the surface is darker, and each bounce after the first is weaker by this factor.
         """
         scale = self.value("scale").to(light)
         return light * (scale.detach() - scale).exp()
 
     def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Cosine (N, H, W, 1) of the angle between the optical axis and each pixel's ray.
+        """Compute the cosine (N, H, W, 1) of the angle between the optical axis and the ray of each pixel.
 
-        `index` (N,): the photographs, which are `scale` times smaller.
+        `index` (N,): the photographs. `scale`: how many times smaller they are.
         """
         width, height = (size // scale for size in self.rig.sizes[index[0]])
         views = self(scale)
@@ -140,23 +143,23 @@ class Calibration(nn.Module):
         return self.estimate().response
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Convert scene radiance (N, H, W, 3) to what the cameras record.
+        """Convert scene radiance (N, H, W, 3) to the values that the cameras record, by the current response.
 
-        `index` (N,): the photographs, which are `scale` times smaller.
+        `index` (N,): the photographs. `scale`: how many times smaller they are.
         """
         response = self.response()
         return response.recorded(radiance, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Convert recorded values (N, H, W, 3) to scene radiance, without gradients: the inverse of `recorded`."""
+        """Convert recorded values (N, H, W, 3) to scene radiance: the inverse of `recorded`, without gradients."""
         response = self.response()
         return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     def refined_photographs(self, photographs: Photographs, views: Views) -> Photographs:
-        """Return `photographs` for the renderer with the cameras and lights of `views` and the current room light.
+        """Return `photographs`, for the renderer, with other cameras and lights and with the current room light.
 
-        `views`: cameras and lights of all P photographs. The result has no gradients.
+        `views`: the cameras and lights of all P photographs. The result has no gradients.
         """
         room = self.room_harmonics().double().numpy(force=True)
         return replace(prediction.with_views(photographs, views), room=room if room.any() else None)
@@ -164,7 +167,7 @@ class Calibration(nn.Module):
     def room_harmonics(self) -> Tensor:
         """Return the current spherical harmonics (BASIS, 3) of the room.
 
-        If they are not refined, `scale` applies to them.
+        If they are not refined, they are those of the capture times the factor of all lights, `scale`.
         """
         harmonics = self.room.harmonics
         return harmonics if "ambient" in self.refined else harmonics / self.albedo_factor
@@ -173,8 +176,8 @@ class Calibration(nn.Module):
     def room_share(self, harmonics: Tensor) -> Tensor:
         """Compare room light, `harmonics` (BASIS, 3), with the photographs' own lights at the object.
 
-        Returns the room's mean irradiance (3,), divided by that of a surface facing a light. If photographs have no
-        lights of their own, returns the room's mean radiance (3,).
+        Returns the mean irradiance by the room, divided by the irradiance of a surface that faces the photograph's
+        light (3,). If photographs have no lights of their own, it returns the mean radiance (3,) of the room.
         """
         now = self()
         distance2 = torch.where(self.rig.finite, (now.places - self.rig.center).square().sum(-1, keepdim=True), 1.0)
@@ -183,13 +186,13 @@ class Calibration(nn.Module):
         return mean / own if bool((own > 0).all()) else mean / math.pi
 
     def prior(self) -> Tensor:
-        """Loss of the Gaussian priors: half the sum of squares of all unknowns, per photograph."""
+        """Compute the loss of the Gaussian priors: half the sum of squares of all unknowns, per photograph."""
         return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.rig)
 
     def parameters_without_solver(self) -> list[list[Tensor]]:
-        """List the parameters that an optimiser follows by gradient, because no solver estimates them.
+        """List the parameters that an optimiser must train, because no solver estimates them.
 
-        One list per option of `--refine`.
+        Returns a list of parameters for each option of `--refine`.
         """
         groups: dict[str, list[Tensor]] = {}
         for name, unknown in self.unknowns.items():
@@ -198,9 +201,9 @@ class Calibration(nn.Module):
         return list(groups.values())
 
     def current_and_given(self, option: str) -> list[tuple[Tensor, Tensor]]:
-        """List pairs (current value, value of the capture) of tensors for the unknowns of an `option` of `--refine`.
+        """List (current value, value of the capture), two tensors, for each unknown of an `option` of `--refine`.
 
-        The current value may be changed in place.
+        The caller may change the current value in place.
         """
         if option == "ambient":
             return [(self.room.harmonics, self.room.given)]

@@ -1,4 +1,4 @@
-"""The camera response as a fit refines it: what lens, gain and tone curve make of radiance."""
+"""The camera response that a fit refines: how vignetting, gain and tone curve change radiance."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -30,30 +30,30 @@ class CameraResponse(NamedTuple):
 
     @property
     def has_vignetting(self) -> bool:
-        """Test whether there is vignetting, known or refined. `recorded` and `linear` then need `cosines`."""
+        """Test whether there is vignetting, known or refined. If so, `recorded` and `linear` need `cosines`."""
         return self.vignetting is not None or bool(self.known_vignetting.any())
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """Convert scene radiance (N, ..., 3) to what cameras record, after the known part of their response is removed.
+        """Convert scene radiance (N, ..., 3) to recorded values from which the known response has been removed.
 
-        `index` (N,): the photographs. `cosines` (N, ..., 1): of the angle between pixel ray and optical axis; needed
-        with vignetting.
+        Observed photographs have such values. `index` (N,): the photographs. `cosines` (N, ..., 1): cosine of the angle
+        between the ray of a pixel and the optical axis; needed with vignetting.
         """
         known, unknown = self.factors(radiance, index, cosines)
         return self.with_curve(radiance * known * unknown, self.gammas[index]) / known
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """Convert recorded values (N, ..., 3) to scene radiance, without gradients: the inverse of `recorded`."""
+        """Convert recorded values (N, ..., 3) to scene radiance. It is the inverse of `recorded`, without gradients."""
         known, unknown = self.factors(recorded, index, cosines)
         return self.without_curve(recorded * known, self.gammas[index]) / known / unknown
 
     def factors(
         self, like: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None
     ) -> tuple[Tensor | float, Tensor | float]:
-        """Return (known, refined) factors (N, ..., 3) of vignetting times gain, in the dtype of `like`.
+        """Compute the factors of vignetting times gain: (factors of the capture, refined factors).
 
-        The known factors are those of the capture. Each is 1.0 if there is none.
+        Each is a tensor (N, ..., 3) in the dtype and on the device of `like`, or 1.0 if there are no such factors.
         """
         ones = [1] * (like.ndim - 2)
 
@@ -69,10 +69,7 @@ class CameraResponse(NamedTuple):
         return known, unknown
 
     def with_curve(self, radiance: Tensor, gammas: Tensor) -> Tensor:
-        """Apply the tone curve to radiance (N, ...).
-
-        `gammas` (N,): exponents of the photographs, known from the capture.
-        """
+        """Apply the refined tone curve to radiance (N, ...). `gammas` (N,): exponents that the capture knows."""
         if self.exponent is not None:
             relative = radiance / self.exposure
             radiance = radiance * relative.clamp(min=DARKEST) ** (self.exponent.exp().to(radiance) - 1)
@@ -80,7 +77,7 @@ class CameraResponse(NamedTuple):
 
     @torch.no_grad()
     def without_curve(self, recorded: Tensor, gammas: Tensor) -> Tensor:
-        """Undo the tone curve in recorded values (N, ...): the inverse of `with_curve`."""
+        """Undo the refined tone curve in recorded values (N, ...). It is the inverse of `with_curve`."""
         if self.contrast is not None:
             recorded = with_contrast(recorded, (-self.contrast).exp(), gammas)
         if self.exponent is None:
@@ -92,7 +89,7 @@ class CameraResponse(NamedTuple):
 def with_contrast(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
     """Apply an S-curve of steepness `contrast` to values (N, ...) that were decoded with the exponents `gammas` (N,).
 
-    Two S-curves in a row are one, whose steepness is the product. So the capture's own contrast is not needed.
+    Two S-curves in a row are one S-curve whose steepness is the product. So the capture's contrast is not needed here.
     """
     gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
     lit = values.clamp(min=BLACK)  # below it the curve is a straight line

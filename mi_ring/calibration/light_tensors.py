@@ -20,7 +20,7 @@ class LightTensors(NamedTuple):
 
     @classmethod
     def of(cls, lights: Sequence[Light]) -> "LightTensors":
-        """Convert lights to tensors."""
+        """Convert L lights to tensors."""
         finite = [light.kind == "point" for light in lights]
         places = [light.vector if point else -light.vector for light, point in zip(lights, finite)]
         numbers = (np.array(part, float).reshape(-1, 3) for part in (places, [light.rgb for light in lights]))
@@ -28,9 +28,9 @@ class LightTensors(NamedTuple):
         return cls(at, torch.tensor(finite, dtype=torch.bool)[:, None], rgb)
 
     def moved(self, offset: Tensor, distance: float) -> "LightTensors":
-        """Move point lights by `distance` [scene units] times `offset` (L, 3).
+        """Return the lights, moved by `offset` (L, 3). The unit of `offset` is `distance` [scene units].
 
-        Distant lights are rotated by `offset` [rad] instead.
+        Directions of distant lights are turned instead; the unit of `offset` is then the radian.
         """
         moved = self.places + offset * torch.where(self.finite, distance, 1.0)
         return self._replace(places=torch.where(self.finite, moved, F.normalize(moved, dim=-1)))

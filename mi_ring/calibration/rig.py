@@ -1,4 +1,4 @@
-"""The rig: what a capture says about its cameras and lights, as tensors, and estimates that differ from it."""
+"""The rig: cameras and lights as a capture gives them, as tensors, and estimates that differ from them."""
 
 from dataclasses import dataclass, replace
 
@@ -20,10 +20,7 @@ INSIDE = 0.999  #: share of the range in which a lens distortion can be inverted
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated cameras, lights and camera response.
-
-    It starts from the capture, and each unknown changes it in turn.
-    """
+    """Estimated cameras, lights and camera response: those of the capture, changed by each unknown in turn."""
 
     views: Views  #: lights as in the capture
     offset: Tensor  #: (light places, 3) or (): of the lights [rig's distance], of distant ones [rad]
@@ -41,18 +38,19 @@ class Rig:
     """Cameras and lights as the capture gives them, as tensors that stay constant during a fit.
 
     Photographs with equal focal lengths and distortion share a `lens`. Photographs with the same light position share a
-    `place`; a flash that moves with the camera has one place for all, in camera coordinates.
+    `place`. A flash that moves with the camera has one place for all photographs, in camera coordinates.
     """
 
     def __init__(
         self, capture: Capture, center: np.ndarray, exposure: float, fitted: np.ndarray | None = None,
         power: float = 1.0, guessed: bool = False, ahead: bool = True, lamps: bool = False,
     ) -> None:  # fmt: skip
-        """Take cameras and lights from a capture. `center` (3,): of the object. `exposure`: the object's mean radiance.
+        """Take cameras and lights from a capture.
 
-        `fitted`: indices of the photographs that are fitted; default: all. `power`: initial factor of all lights.
-        `guessed`: nobody measured the lights' places. `ahead`: a flash may also move along the camera's axis. `lamps`:
-        the scene's own lamps are unknown.
+        `center` (3,): centre of the object. `exposure`: mean radiance of the object. `fitted`: indices of the
+        photographs that are fitted; default: all. `power`: initial factor of all lights. `guessed`: the places of the
+        lights are guesses, not measurements. `ahead`: the fit may also move a flash along the camera's axis. `lamps`:
+        the fit refines the scene's own lamps.
         """
         self.path, self.exposure, self.power, self.guessed = capture.path, exposure, power, guessed
         lights = capture.photographs.lights
@@ -105,12 +103,12 @@ class Rig:
         return several[per]
 
     def estimate(self) -> Estimate:
-        """Return the estimate that equals the capture, before unknowns change it."""
+        """Return the estimate that equals the capture. The unknowns then change it."""
         none = torch.zeros(())
         return Estimate(self.views, none, none, none, none, self.response)
 
     def views_of(self, estimate: Estimate) -> Views:
-        """Return the cameras and lights of an estimate. Its offsets and factors of lights are applied."""
+        """Return the cameras and lights of an estimate. Its offsets move the lights, its factors scale them."""
         now = estimate.views
         offset = (self.free * estimate.offset).expand(self.count("light"), 3)[self.place]
         if self.flash is not None:
@@ -126,6 +124,6 @@ class Rig:
         return now._replace(places=places, strengths=now.strengths * estimate.log_power.exp(), distortion=distortion)
 
     def lamps_of(self, estimate: Estimate) -> LightTensors:
-        """Return the scene's lamps with the offsets and factors of an estimate applied."""
+        """Return the scene's lamps, moved by the offsets and scaled by the factors of an estimate."""
         strengths = self.power * estimate.log_lamp_power.exp() * self.lamps.strengths
         return self.lamps._replace(strengths=strengths).moved(estimate.lamp_offset, self.distance)

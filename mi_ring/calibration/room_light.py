@@ -1,4 +1,4 @@
-"""The light of the room as an unknown: spherical harmonics, solved by linear least squares during a fit."""
+"""The light of the room as an unknown of a fit: spherical harmonics, estimated by linear least squares."""
 
 from collections.abc import Callable, Iterable
 
@@ -20,7 +20,7 @@ FINE = 0.3  #: progress from which the only light has its full order
 
 
 class RoomLight(nn.Module):
-    """Room light as an unknown: its spherical harmonics, and the normal equations from which they are estimated."""
+    """Room light as an unknown: its spherical harmonics, and the normal equations that determine them."""
 
     which: list[int]  #: numbers of the harmonics that may be non-zero
     given: Tensor  #: (BASIS, 3) from the capture
@@ -29,11 +29,11 @@ class RoomLight(nn.Module):
     vector: Tensor  #: (3, BASIS) right sides of the normal equations
 
     def __init__(self, given: Tensor, exposure: float, frames: Iterable[str] = ("world",), alone: bool = False) -> None:
-        """Start from harmonics `given` (BASIS, 3). `exposure`: mean radiance of the object.
+        """Start from the harmonics `given` (BASIS, 3). `exposure`: mean radiance of the object.
 
-        `frames`: axes ("world", "camera") whose harmonics are unknown; others stay as given. Unknown in both, they
-        could replace a flash elsewhere and another reflectance. `alone`: there is no other light. Then the harmonics
-        have a higher order, once the shape is no longer coarse.
+        `frames`: the axes, "world" or "camera", whose harmonics are estimated; the others stay as given. If both were
+        estimated, they could imitate a flash elsewhere or another reflectance. `alone`: there is no other light. Then
+        more harmonics are estimated, as soon as the shape is no longer coarse.
         """
         super().__init__()
         self.exposure, self.frames, self.alone = exposure, tuple(frames), alone
@@ -45,7 +45,7 @@ class RoomLight(nn.Module):
         self.register_buffer("vector", torch.zeros(3, BASIS))
 
     def forget(self) -> None:
-        """Discard all photographs that were added to the normal equations. The harmonics stay."""
+        """Empty the normal equations. The harmonics do not change."""
         self.matrix.zero_()
         self.vector.zero_()
 
@@ -54,11 +54,11 @@ class RoomLight(nn.Module):
         self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
         total: Callable[[Tensor], Tensor] = lambda equations: equations,
     ) -> None:  # fmt: skip
-        """Add photographs to the normal equations, and solve for the harmonics.
+        """Add photographs to the normal equations, solve them, and set the harmonics to the solution.
 
-        `around`: how the photographs respond to each harmonic. `observed`, `predicted` (N, H, W, 3): linear radiance;
+        `around`: the light of each harmonic in the photographs. `predicted`, `observed` (N, H, W, 3): linear radiance;
         the prediction contains the current room light without occlusion. `counted` (N, H, W) bool: pixels that show the
-        object. `progress`: of the fit, in [0, 1]. `total`: function that sums a tensor over all processes.
+        object. `progress`: progress of the fit, 0 to 1. `total`: a function that sums a tensor over all processes.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:

@@ -1,12 +1,12 @@
-"""The unknowns of calibration: cameras, lenses, lights and the camera's response. One class for each unknown.
+"""The unknowns of calibration: cameras, lenses, lights and the camera's response. Each unknown has a class.
 
-A new unknown is a class here with an entry in `UNKNOWNS`. Its parameters count in standard deviations of its prior, so
-that 0 is what the capture says.
+A new unknown is a class here with an entry in `UNKNOWNS`. The unit of its parameters is the standard deviation of its
+prior. At 0 the unknown has the value of the capture.
 
-Some unknowns cannot be told apart from photographs; only the priors decide between them. Brightness of lights and
-albedo: the logarithms of `power` and `gain` have mean zero in each colour, and `scale` changes the albedo, too. The
-place, rotation and scale of the whole scene. Focal length and distance. The cone of a flash and vignetting, almost, if
-the flash is beside the lens.
+Photographs do not determine some combinations of unknowns; the priors determine them. These are: the brightness of the
+lights and the albedo (so the logarithms of `power` and `gain` have mean zero in each colour, and `scale` also changes
+the albedo); position, rotation and scale of the whole scene; focal length and distance; almost also the cone of a flash
+and vignetting, if the flash is beside the lens.
 """
 
 from abc import ABC, abstractmethod
@@ -27,7 +27,7 @@ VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measu
 
 
 class Found(NamedTuple):
-    """The capture before and after a fit, with what else `Unknown.describe` needs to put the calibration into words."""
+    """The capture before and after a fit, and other values that `Unknown.describe` needs."""
 
     rig: Rig
     before: Capture  #: as the capture says
@@ -37,14 +37,17 @@ class Found(NamedTuple):
     several: bool  #: Are the photographs' lights the first of several unknown lamps?
 
     def means(self, of: Callable[[Shot], float]) -> tuple[float, float]:
-        """Mean of `of(shot)` over all photographs. Returns (mean before the fit, mean after the fit)."""
+        """Compute the mean of the number `of(shot)` over all photographs: (before the fit, after the fit)."""
         before, after = (float(np.mean([of(shot) for shot in side.shots])) for side in (self.before, self.after))
         return before, after
 
 
 @dataclass(frozen=True)
 class Unknown(ABC):
-    """Base class of the unknowns of calibration. Each has `components` numbers per photograph, lens, light or lamp."""
+    """Base class of the unknowns of calibration.
+
+    An unknown has `components` numbers for each photograph, lens, light or lamp, or for the capture, as `per` says.
+    """
 
     name: str
     option: str  #: of `--refine`
@@ -59,22 +62,22 @@ class Unknown(ABC):
     solved: ClassVar[bool] = False  #: Has it a solver in `fitting`? Others follow their gradient by Adam.
 
     def shape(self, rig: Rig) -> tuple[int, ...]:
-        """Shape of the parameter: (number of photographs, lenses, lights or lamps; components).
+        """Return the shape of the parameter: (number of photographs, lenses, lights or lamps; components).
 
-        The first is left out if the whole capture has one value, the second if it is 1.
+        The first number is missing if `per` is "capture". The second is missing if there is one component.
         """
         several = () if self.per == "capture" else (rig.count(self.per),)
         return several + (self.components,) * (self.components > 1)
 
     def width_for(self, rig: Rig) -> float:
-        """Standard deviation of the prior for this rig, in the unknown's own unit."""
+        """Return the standard deviation of the prior for this rig, in the unknown's own unit."""
         return self.width
 
     def rows(self, rig: Rig, index: np.ndarray) -> list[np.ndarray]:
         """Find the rows of the parameter that affect the photographs `index` (n,).
 
-        Returns arrays (n,) that hold one row number per photograph: one array for each lamp, because all lamps light
-        every photograph; a single array for other unknowns.
+        Returns a list of arrays (n,) with one row number per photograph. The list has one array per lamp for an unknown
+        of lamps, because all lamps light every photograph. For all other unknowns it has one array.
         """
         if self.per == "lamp":  # all lamps light all photographs
             return [np.full_like(index, k) for k in range(rig.count("lamp"))]
@@ -85,20 +88,20 @@ class Unknown(ABC):
 
     @abstractmethod
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        """Return the estimate `now`, changed by this unknown. `value`: the unknown's current value, in its own unit."""
+        """Return the estimate `now`, changed by this unknown. `value`: its current value, in the unknown's own unit."""
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any] | None:
-        """Describe the result in words.
+        """Describe the result of the fit: (meaning in words, value before the fit, value after, standard deviation).
 
-        Returns (name, value before the fit, value after it, standard deviation), or None. `value`, `std`: value and
-        standard deviation of the parameter, in the unknown's own unit.
+        Returns None if the unknown belongs to single photographs. `value`, `std`: value and standard deviation of the
+        parameter, in the unknown's own unit.
         """
         return None
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any] | None:
-        """Describe the result for one photograph.
+        """Describe the result for one photograph: (key in calibration.json, value, standard deviation).
 
-        Returns (key in calibration.json, value, standard deviation), or None. `value`, `std`: those of this photograph,
+        Returns None if photographs share the unknown. `value`, `std`: value and standard deviation for this photograph,
         in the unknown's own unit.
         """
         return None
@@ -119,7 +122,7 @@ class Turn(Unknown):
 
 
 class Move(Unknown):
-    """Motion of each camera along its own axes [distance of the rig]."""
+    """Translation of each camera along its own axes [`Rig.distance`]."""
 
     solved = True
 
@@ -170,7 +173,7 @@ class Distortion(Unknown):
 
 
 class LightPlace(Unknown):
-    """Offset of each light's position [distance of the rig]; of a distant light: of its direction [rad]."""
+    """Offset of each light's position [`Rig.distance`]. For a distant light: offset of its direction [rad]."""
 
     def width_for(self, rig: Rig) -> float:
         return self.width * (VAGUE if rig.guessed else 1.0)
@@ -259,10 +262,7 @@ class Contrast(Unknown):
 
 
 class Gain(Exposure):
-    """Logarithm of a factor of the values that each photograph records, for each colour channel.
-
-    A solver estimates it without gradients.
-    """
+    """Logarithm of a factor of all values of a photograph, for each colour channel. It has no gradient."""
 
     changes = "gain"
 
@@ -273,7 +273,7 @@ class Gain(Exposure):
 class Scale(Unknown):
     """Logarithm of a common factor of all lights.
 
-    Only indirect light determines it: in direct light albedo cancels it.
+    Only interreflection determines it. In direct light, a lower albedo cancels the factor.
     """
 
     changes = "indirect"
@@ -338,13 +338,13 @@ OWN_LIGHTS = {unknown.option for unknown in UNKNOWNS.values() if unknown.own_lig
 
 
 def centred(value: Tensor, rig: Rig) -> Tensor:
-    """Subtract the mean over fitted photographs from log factors `value` (P, 3); 0 for held-out photographs."""
+    """Subtract the mean over the fitted photographs from log factors `value` (P, 3). Held-out photographs get 0."""
     result = torch.zeros_like(value)
     result[rig.fitted] = value[rig.fitted] - value[rig.fitted].mean(0)
     return result
 
 
 def lens_cameras(found: Found) -> Iterable[list]:
-    """Yield for each lens the camera of its first photograph: [before the fit, after the fit]."""
+    """Yield two lists: for each lens, the camera of its first photograph, before the fit and after the fit."""
     first = np.unique(found.rig.lens.numpy(), return_index=True)[1]
     return ([side.shots[k].whole.camera for k in first] for side in (found.before, found.after))

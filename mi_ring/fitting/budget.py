@@ -1,4 +1,4 @@
-"""Time: how long an iteration of each stage takes on this machine, and which fit a given time allows."""
+"""Measures how long iterations take on this machine, and plans a fit for a given time."""
 
 import math
 import time
@@ -20,10 +20,10 @@ Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and wi
 
 
 def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = int) -> Costs:
-    """Measure how many seconds an iteration takes at each mesh level and photograph width of the `stages`.
+    """Measure how long an iteration takes at each mesh level and photograph width of the `stages`.
 
-    Runs two iterations of each in a trial fit and times the second. Returns seconds by (level, width), or {} if
-    `interrupted()` returns a signal.
+    A trial fit makes two iterations at each, and the second one is timed; `fit` does not change. Returns seconds by
+    (level, width). If `interrupted()` returns a signal number, it stops and returns {}.
     """
     print("Measuring how long iterations take, to say how long is left", flush=True)
     trial = Fit(fit.problem.given, fit.problem.config, terms=fit.loss.terms, state=fit.state())
@@ -47,20 +47,24 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
 
 
 def replan(fit: Fit, config: Config) -> None:
-    """Give new settings to a fit that has not begun: other stages, iterations, mesh level or regulariser."""
+    """Give the settings `config` to a fit that has made no iteration yet.
+
+    Only these may differ from its present settings: stages, iterations, mesh level and regulariser.
+    """
     fit.problem = fit.optimisation.problem = replace(fit.problem, config=config)
     fit.ring.subdivisions, fit.schedule = config.subdivisions, fit.plan(config)
 
 
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
-    """List the stages of all fits that use one of `configs` and begin like this fit."""
+    """List the stages that this fit would have with each of the settings `configs`, one after the other."""
     return [stage for config in configs for stage in fit.plan(config).stages]
 
 
 def fitting_into(seconds: float, configs: Sequence[Settings], plan: Planner, costs: Costs) -> Settings:
-    """Choose the settings whose fit takes about `seconds`, and set their number of iterations to fill that time.
+    """Choose from `configs` the settings whose fit takes about `seconds`. Returns them with other iterations.
 
-    `plan` returns the schedule for settings; `costs`: seconds per iteration, from `measure`.
+    Their number of iterations is changed so that the fit fills the time. `plan`: returns the schedule of settings.
+    `costs`: seconds per iteration, from `measure`.
     """
     config = min(configs, key=lambda config: abs(math.log(seconds_of(config, plan, costs) / seconds)))
     around = seconds_around(config, plan, costs)
@@ -74,12 +78,12 @@ def fewest_seconds(configs: Sequence[Config], plan: Planner, costs: Costs) -> fl
 
 
 def seconds_of(config: Config, plan: Planner, costs: Costs) -> float:
-    """Estimate the total time [s] of a fit: its iterations, the pictures before them, and writing the results."""
+    """Estimate the total time [s] of a fit: pictures before the first iteration, iterations, and results."""
     iterations = sum((s.last - s.first) * costs[s.level, s.width] for s in plan(config).stages)
     return iterations + seconds_around(config, plan, costs)
 
 
 def seconds_around(config: Config, plan: Planner, costs: Costs) -> float:
-    """Estimate the time [s] of a fit outside its iterations: for the pictures before them and for the results."""
+    """Estimate the time [s] that a fit takes beside its iterations: for the pictures before them and the results."""
     last = plan(config).stages[-1]
     return AROUND * costs[last.level, last.width]

@@ -1,4 +1,4 @@
-"""Checkpoints: what `--resume` needs, and whether the files of the fit are still the same."""
+"""Writes and reads checkpoints, from which `--resume` continues, and tests whether input files have changed since."""
 
 import contextlib
 import math
@@ -58,15 +58,18 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
 
 
 def by_option(settings: dict) -> dict:
-    """Convert settings to one entry per command-line option: each loss weight gets a key `weights.NAME`."""
+    """Convert settings to a dictionary with one entry per command-line option.
+
+    The dictionary `weights` in it is replaced by one entry `weights.NAME` for each weight of the loss.
+    """
     weights = {f"weights.{name}": value for name, value in settings["weights"].items()}
     return {name: value for name, value in settings.items() if name != "weights"} | weights
 
 
 def require_same_files(state: dict, capture: Capture, config: Config, folder: Path) -> None:
-    """Raise InputError if a file that the fit reads has changed since the checkpoint with this `state` was written.
+    """Raise InputError if a file that the fit reads has changed since the checkpoint was written.
 
-    `folder`: the results folder, for the message.
+    `state`: content of the checkpoint. `folder`: the results folder, for the message.
     """
     before, now = state["files"], digests(capture, config)
     for name in sorted(before.keys() | now.keys()):
@@ -76,10 +79,10 @@ def require_same_files(state: dict, capture: Capture, config: Config, folder: Pa
 
 
 def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
-    """Restore a fit from the `state` in a checkpoint, so that it can continue.
+    """Make a fit that continues from a checkpoint.
 
-    `folder`: the results folder, for messages. Raises InputError if the state is not that of a fit, or if a file of the
-    capture has changed since.
+    `state`: content of the checkpoint. `folder`: the results folder, for messages. Raises InputError if the state is
+    not that of a fit, or if a file of the capture has changed since the checkpoint was written.
     """
     require_same_files(state, capture, config, folder)
     try:
@@ -96,7 +99,7 @@ def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
 
 
 def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
-    """Write a checkpoint of `fit` into `folder`, and keep the previous one. `files`: what `digests` returned.
+    """Write a checkpoint of `fit` into `folder`, and keep the previous checkpoint. `files`: result of `digests`.
 
     Raises InputError if the checkpoint cannot be written.
     """
@@ -111,7 +114,7 @@ def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
 def digests(capture: Capture, config: Config) -> dict[str, str]:
     """Hash every file that a fit reads, except textures.
 
-    Returns hashes by file name relative to the scene file's folder.
+    Returns hashes by file name. The names are relative to the folder of the scene file.
     """
     files = {capture.path, capture.shape.domain_file}
     files |= {file for shot in capture.shots for file in shot.files}

@@ -1,4 +1,4 @@
-"""The settings of a fit. `Config` joins three frozen dataclasses: common settings, tuning and ablation.
+"""The settings of a fit. `Config` joins three frozen dataclasses: `Common`, `Tuning` and `Ablation`.
 
 The docstrings of the fields are the help texts of `mi-ring fit`. The help keeps their line breaks.
 """
@@ -38,48 +38,50 @@ class Common:
     """Settings for every user."""
 
     light: Literal["capture", "environment", "turntable", "lamps", "auto"] = "capture"
-    """The kind of light in the photographs. Choose another than capture if the lights are not in the scene file.
+    """The kind of light in the photographs. Set another kind than capture if the lights are not in the scene file.
     capture: the lights of the scene file.
-    environment: unknown light from all sides, fixed in the world.
-    turntable: unknown light from all sides, fixed to the camera, because the object turned.
-    lamps: one to three unknown lamps, fixed in the world.
-    auto: coarse fits try all kinds and choose the one that explains the photographs best. This takes longer."""
+    environment: unknown light from all sides. It does not move, while the camera moves around the object.
+    turntable: unknown light from all sides. It stands still relative to the camera, while the object turns.
+    lamps: one to three unknown lamps. They do not move, while the camera moves around the object.
+    auto: one of these four. Coarse fits find out which kind explains the photographs best. This takes longer."""
     refine: tuple[Unknown, ...] = ("auto",)
-    """Calibration that the fit corrects, in addition to surface and material. It starts from the scene file.
-    auto: light, power and ambient, and scale if it is needed. If the light is unknown: gain and ambient.
+    """Calibration that the fit corrects, in addition to surface and material. Initial values come from the scene file.
+    auto: light, power, ambient. Also scale, if with these lights the object would reflect more light than it gets.
+    With another --light than capture, auto is gain and ambient; for lamps also light and lamps.
     none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto cameras focal.
     cameras: position and direction of each camera.
     focal, principal: focal length and principal point of each lens.
     distortion: first radial distortion coefficient of each lens.
-    light: position of a flash that moves with the camera. For other lights: position or direction of each light.
-    power: intensity and colour of the light of each photograph.
-    gain: exposure and white balance of each photograph. It cannot be combined with power.
-    falloff: how fast the flash gets weaker away from its axis.
+    light: position or direction of the lights inside the <sensor> elements: each lights one photograph, as a flash.
+    lamps: position and intensity of the point and directional emitters outside <sensor>: they light all photographs.
+    power: intensity and colour of the light of each photograph. Give it if the flash varied.
+    gain: exposure and white balance of each photograph. Give it instead of power if the camera's exposure varied.
+    falloff: how fast the light of the flash decreases away from the axis of the flash.
     vignetting: how much darker the lens makes the corners of the image.
     curve, contrast: exponent of the camera's response curve, and steepness of its S shape.
-    scale: one factor for all light intensities, found by interreflection.
+    scale: one factor for the intensities of all lights. The fit finds it from interreflection.
     ambient: light of the room, from all sides.
-    lamps: position and intensity of the scene's own point and directional emitters.
-    masks: outlines of the object. The fit finds them again after a half and after three quarters of its iterations."""
+    masks: outlines of the object. The fit finds new masks after one half and three quarters of its iterations."""
     masks: Literal["auto", "given", "none"] = "auto"
     """The masks that the fit uses. Set none if the masks of the scene file are wrong and the background is dark.
-    given: the masks of the scene file. none: the fit ignores them; in a dark room the bright pixels are the mask.
+    given: the masks of the scene file. none: the fit ignores these masks; in a dark room it uses the bright pixels.
     auto: given if the scene file has masks, otherwise none. To fit without any mask, set --weights.mask 0."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
-    """The start surface that the fit deforms. The result has the same number of handles (genus).
+    """The start surface that the fit deforms. The fitted surface has the same number of handles (genus).
     hull: the visual hull of the masks. mesh FILE: a closed mesh in scene units. sphere: a sphere around the object.
-    auto: the domain that the scene file names; without one, the hull; without masks, a sphere.
-    A start near the object saves time. Give a mesh if the masks do not show a handle of the object."""
+    auto: the mesh that the scene file names as `domain`. If it names none: hull. If there are no masks: sphere.
+    A start surface near the object saves time. Give a mesh if the object has a handle that the masks do not show."""
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameters of the BSDF that the fit finds, each with its lowest and highest value (inf: no limit).
-    Set it if the BSDF of the scene is not cooktorrance: --parameters base_color 0 1 roughness 0.05 1"""
+    Only needed if the BSDF of the scene is not cooktorrance. Example: --parameters base_color 0 1 roughness 0.05 1"""
     holdout: int = 0
     """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.
     For example, 8 leaves out the fifth, the thirteenth, and so on. The fit then has fewer photographs.
-    If a correction by --refine that all photographs share does not improve this test, the fit undoes it."""
+    At the end the fit undoes each correction of --refine that does not improve this test, except the corrections of
+    single photographs: cameras, power and gain."""
     iterations: int = 460
-    """Number of iterations of all stages together, for example 1400. More take longer and give finer detail.
-    A fit from a hull or a mesh makes fewer iterations, a fit under an unknown environment 15 % more."""
+    """Number of iterations of all stages together, for example 1400. More iterations give finer detail and take longer.
+    A fit from a hull or a mesh makes fewer iterations. A fit under an unknown environment makes 15 % more."""
     seed: int = 0
     """Random seed. Fits with different seeds show how much results vary by chance."""
     deterministic: bool = False
@@ -92,23 +94,23 @@ class Tuning:
     """How fine and how fast the fit is. Presets set most of these options."""
 
     levels: tuple[int, ...] = (4, 5, 6)
-    """Level of the mesh in each stage, 0 to 8. Level n has about 10 · 4^n vertices.
-    Higher levels give finer detail. A stage one level higher takes up to four times the time and memory."""
+    """Level of the mesh in each stage, 0 to 8. A mesh of level n has about 10 · 4^n vertices.
+    Higher levels give finer detail. One level more takes up to four times the time and memory."""
     widths: tuple[int, ...] = (128, 256, 512)
     """Largest width of the photographs in each stage [px]: one number for each of --levels.
-    Wider photographs are reduced to it. Larger widths give finer detail and take longer."""
+    The fit reduces wider photographs to this width. Larger widths give finer detail and take longer."""
     shares: tuple[float, ...] = (0.45, 0.46, 0.09)
     """Iterations of each stage, from coarse to fine, as a share of all: one number above 0 for each of --levels.
-    Only the ratios count. A larger last number gives finer detail and takes longer. A fit from a hull or a mesh skips
-    two thirds of the iterations of the first stage. It adds 40 % of the skipped ones to the second stage."""
+    Only the ratios count. A larger last number gives finer detail and takes longer. A fit that starts from a hull or a
+    mesh skips two thirds of the iterations of the first stage. It adds 40 % of the skipped iterations to the second."""
     subdivisions: int = 6
-    """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. It does not change the fit.
+    """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
     mi-ring export can write other levels later."""
     batch: int = 8
     """Photographs in each iteration. More photographs make an iteration slower and its gradient less noisy."""
     steps: int = 3
     """Number of steps in which the network moves the start surface to the object (Euler steps; the paper's T).
-    Time and memory grow with it. Raise it if the surface folds over: more steps make folds less likely."""
+    More steps take more time and memory. Give more steps if the surface folds over; they make folds less likely."""
     spp: int = 1
     """Samples per pixel of predicted photographs. More samples make an iteration slower and its gradient less noisy."""
     weights: dict[str, float] = field(default_factory=lambda: dict(WEIGHTS))
@@ -116,27 +118,27 @@ class Tuning:
     rgb: the colours agree with the photographs.
     mask: the silhouettes agree with the masks.
     velocity: the deformation is smooth (the paper's lambda). Raise it for noisy photographs, lower it for fine detail.
-    calibration: refined calibration stays near that of the scene file.
-    settling: the material varies little in the last stage, under an unknown environment.
+    calibration: the corrected calibration stays near the calibration of the scene file.
+    settling: the material varies little over the surface. Only in the last stage under an unknown environment.
     normal_variation: the surface has flat faces and sharp edges. Try 0.01 if the object has them.
     material_rank: the material is a mixture of few materials. Try 0.01 if the object has few materials."""
     velocity_decay: float = 0.03
-    """Share of --weights.velocity that is left at the end of the fit, above 0. 1: the weight does not change.
-    A small share gives finer detail, but the surface may fold over if the fit is short."""
+    """During the fit, the weight of velocity falls to this share of --weights.velocity, above 0. 1: it stays constant.
+    A small share gives finer detail. In a short fit a small share may let the surface fold over."""
     laplacian_scale: float = 0.01
     """How much the term velocity penalises high frequencies of the deformation, 0 or more (the paper's alpha).
     A larger value gives a smoother surface with less detail."""
     learning_rate: float = 3e-3
-    """Learning rate of Adam at the start. Raise it for faster progress; lower it if the loss does not fall steadily."""
+    """Learning rate of Adam at the start. Raise it for faster progress. Lower it if the loss does not fall steadily."""
     muon_rate: float = 3e-2
-    """Learning rate of Muon at the start. Muon trains the hidden layers unless --optimizer is adam.
-    Raise it for faster progress; lower it if the loss does not fall steadily."""
+    """Learning rate of Muon at the start. Muon trains the hidden layers of the networks. --optimizer adam has no Muon.
+    Raise it for faster progress. Lower it if the loss does not fall steadily."""
     decay: float = 0.1
-    """Share of the learning rates that is left at the end, above 0. 1: the rates do not change.
-    A smaller share gives a steadier end. Learning rates of cameras fall to a half instead."""
+    """During the fit, the learning rates fall to this share of their first values, above 0. 1: they stay constant.
+    With a smaller share the surface changes less at the end. The learning rates of cameras fall to one half instead."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Number format of matrix products. auto: bfloat16 if it is faster than float32 on this machine.
-    Set float32 to compare results of different machines; a fit may then take longer."""
+    Set float32 to compare results of different machines. A fit in float32 may take longer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,39 +147,40 @@ class Ablation:
 
     shadows: bool = True
     """Trace the shadows that the photographs' own lights cast on the object.
-    With --no-shadows a fit is faster, but the surface is wrong, unless each light is at its camera."""
+    --no-shadows makes a fit faster, but the surface becomes wrong if lights are not at the cameras."""
     indirect: bool = True
-    """Predict light that the object reflects onto itself (interreflection), which matters in concave parts.
-    Give --no-indirect if the scene file has wrong intensities of the lights."""
+    """Predict light that the object reflects onto itself (interreflection). It makes concave parts brighter.
+    Give --no-indirect if the light intensities in the scene file are wrong."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
     """How the difference of predicted and observed colours is measured.
     l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.
     log: difference of logarithms, for dark surfaces. l1+log: the mean of l1 and log."""
     optimizer: Literal["muon", "adam"] = "muon"
-    """The optimisers that train the networks. Set adam to compare with the paper.
+    """The optimisers that train the networks. Set adam to train them as in the paper.
     muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all weights, as in the paper."""
     shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
-    """The network that deforms the start surface. The others are for comparison; their surfaces may fold over.
-    ring: the paper's flow; all steps share one network.
-    resnet: each step has its own, narrower network, with about as many weights in total.
-    wide-resnet: each step has its own network, as wide as that of ring, so there are more weights."""
+    """The network that deforms the start surface. Set resnet or wide-resnet only to compare them with ring.
+    ring: the paper's flow. All steps use one network.
+    resnet: each step has its own, narrower network. All together have about as many weights as the network of ring.
+    wide-resnet: each step has its own network, as wide as the network of ring.
+    With resnet and wide-resnet the surface may fold over."""
     encoding: Literal["linear", "octaves", "none"] = "linear"
     """Positional encoding of points in the networks of shape and material.
     linear: frequencies 1, 2, 3, … octaves: frequencies 1, 2, 4, 8, … none: no encoding, which gives little detail."""
     frequencies: int = 16
     """Number of frequencies of the positional encoding, 1 to 64 (1 to 16 for octaves).
-    More frequencies can represent finer detail, and also more noise."""
+    With more frequencies the fit can represent finer detail, and also more noise."""
     resample: bool = True
-    """Sample other points of the start surface in each iteration, so that the networks are trained everywhere.
-    With --no-resample they are trained at the same points only."""
+    """Sample new points of the start surface in each iteration, so that the networks learn the whole surface.
+    With --no-resample all iterations use the same points."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(Ablation, Tuning, Common):
-    """The settings of a fit: all that defines its result except the photographs.
+    """The settings of a fit. Settings and photographs together define the result.
 
-    Its fields are those of `mi_ring.fitting.config.Common`, `mi_ring.fitting.config.Tuning` and
-    `mi_ring.fitting.config.Ablation`. `Config.preset` gives settings that go together. Raises InputError for a value
+    The fields are those of `mi_ring.fitting.config.Common`, `mi_ring.fitting.config.Tuning` and
+    `mi_ring.fitting.config.Ablation`. `Config.preset` returns the settings of a preset. Raises InputError if a value is
     out of range.
     """
 
@@ -226,8 +229,8 @@ class Config(Ablation, Tuning, Common):
     def preset(cls, name: str, **changes: Any) -> "Config":
         """Return the settings of the preset `name`: `fast`, `default`, `fine` or `paper`.
 
-        `changes` replace single settings. A `weights` among the changes replaces only the weights that it names. Raises
-        InputError for an unknown preset.
+        `changes`: other values for single settings. `weights` replaces only the weights that it contains. Raises
+        InputError for an unknown preset and for a value that is out of range.
         """
         if name not in PRESETS:
             raise InputError(f"preset: is {name}, must be one of {', '.join(PRESETS)}")
@@ -238,10 +241,10 @@ class Config(Ablation, Tuning, Common):
 
     @staticmethod
     def load(path: str | Path) -> "Config":
-        """Read the settings of an earlier fit, from its results folder or from the config.json in it.
+        """Read the settings of an earlier fit. `path`: its results folder, or the config.json in this folder.
 
-        Settings without an entry have their defaults. Raises InputError, which names file and field, for an unknown
-        setting or a wrong value.
+        A setting that the file does not contain gets its default. Raises InputError, which names file and setting, for
+        an unknown setting or a wrong value.
         """
         path = Path(path)
         path = path / "config.json" if path.is_dir() else path
@@ -277,7 +280,7 @@ class Config(Ablation, Tuning, Common):
 
 
 def of_type(kind: Any, value: Any) -> Any:
-    """Convert `value`, read from JSON, to the type `kind` of a setting. Raises ValueError if that is impossible."""
+    """Convert a `value` from a JSON file to the type `kind` of a setting. Raises ValueError if this is impossible."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         for one in inner:
@@ -298,7 +301,7 @@ def of_type(kind: Any, value: Any) -> Any:
 
 
 def as_typed(value: Any) -> str:
-    """Format the value of a setting as the user types it on the command line; for messages."""
+    """Format the value of a setting, for messages, as the user types it on the command line."""
     if isinstance(value, dict):
         value = [word for item in value.items() for word in item]
     if isinstance(value, (tuple, list)):

@@ -1,4 +1,4 @@
-"""The course of a fit: what has happened so far."""
+"""The course of a fit: its progress, its log and its measurements so far."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,7 +12,7 @@ LOG_EVERY = 5  #: iterations between entries of the log
 
 @dataclass
 class Course:
-    """The progress of a fit: how many iterations are done, the log, and what the fit has measured so far."""
+    """The course of a fit: the number of iterations that are done, the log, and the measurements so far."""
 
     iteration: int = 0  #: number of iterations that are done
     seconds: float = 0.0  #: time of these iterations, and of coarse fits before them
@@ -21,9 +21,9 @@ class Course:
     validation: dict[str, Any] = field(default_factory=dict)  #: on held-out photographs, when the fit is done
 
     def record(self, it: Iteration, learning_rate: float, regulariser: RegulariserStrength, last: bool) -> None:
-        """Append an entry about the iteration `it` to the log, if one is due.
+        """Append an entry about the iteration `it` to the log, if its number is a multiple of 5 or it is the `last`.
 
-        It holds the unweighted terms of the loss.
+        The entry contains the unweighted terms of the loss. `learning_rate`: the rate of Adam for the networks.
         """
         if it.number % LOG_EVERY and not last:
             return

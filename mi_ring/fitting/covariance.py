@@ -1,7 +1,8 @@
-"""Standard deviations of the unknowns of calibration, with surface and material fixed.
+"""Computes the standard deviations of the unknowns of calibration. Surface and material count as fixed.
 
-Least squares at the solution: how the photographs change with each unknown, together with the errors of the
-predictions, gives the covariance ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section 8.1).
+The covariance follows from least squares at the solution: from the derivatives of the photographs with respect to each
+unknown, and from the errors of the predictions ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section
+8.1).
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +28,7 @@ BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
 
 
 class Layout:
-    """The order of all unknowns of a calibration in one parameter vector with `count` entries."""
+    """The places of all unknowns of a calibration in one parameter vector with `count` entries."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.first, self.count = calibration, {}, 0
@@ -36,9 +37,9 @@ class Layout:
             self.count += getattr(calibration, name).numel()
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
-        """List the unknowns that affect the photographs `index` (n,), as tuples (name, component, positions).
+        """List the components of the unknowns that affect the photographs `index` (n,): (name, component, places).
 
-        `positions` (n,): where the parameter vector holds this component for each photograph.
+        `places` (n,): the index of this component in the parameter vector, for each photograph.
         """
         result = []
         for name, unknown in self.calibration.unknowns.items():
@@ -50,10 +51,10 @@ class Layout:
 
 @torch.no_grad()
 def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
-    """Compute the standard deviation of each unknown, except the room's light: arrays by the unknown's name.
+    """Compute the standard deviation of each refined unknown, except the room's light.
 
-    Each array has the shape and unit of the unknown. Empty if no unknown is refined. `level`: level of the mesh that is
-    rendered.
+    Returns arrays by the name of the unknown, each with the shape and the unit of the unknown; {} if there are none.
+    Renders all fitted photographs. `level`: level of the rendered mesh.
     """
     calibration = model.calibration
     assert calibration is not None
@@ -77,7 +78,10 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
 
 class Equations:
-    """Normal equations of least squares, to which photographs are added one by one, and the residuals' variance."""
+    """The normal equations of least squares and the variance of the residuals. Photographs are added one by one.
+
+    `count`: number N of parameters.
+    """
 
     def __init__(self, count: int) -> None:
         self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
@@ -85,8 +89,8 @@ class Equations:
     def add(self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray) -> None:
         """Add one photograph to the equations.
 
-        `slopes` (K, H, W, C): its derivatives with respect to the entries `places` (K,) of the parameter vector.
-        `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: pixels to use.
+        `slopes` (K, H, W, C): derivatives of the prediction with respect to the entries `places` (K,) of the parameter
+        vector. `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: pixels to use.
         """
         slopes = slopes[:, counted].flatten(1).double()
         np.add.at(self.matrix, np.ix_(places, places), (slopes @ slopes.T).numpy())
@@ -98,13 +102,16 @@ class Equations:
         self.pixels += channels * int(counted.sum())
 
     def information(self) -> np.ndarray:
-        """Compute the Fisher information matrix (N, N) of the added photographs: the inverse of the covariance."""
+        """Compute the Fisher information matrix (N, N) of all added photographs: the inverse of the covariance."""
         return self.matrix * (self.pixels / self.squares if self.squares else 0.0)
 
 
 @dataclass(frozen=True)
 class CovarianceGroup:
-    """The photographs `index`, all of one size, to be rendered from the current model at 1 / `scale` of that size."""
+    """Photographs of one size that are rendered from the current model, `scale` times smaller.
+
+    `index` (n,): the photographs.
+    """
 
     problem: Problem
     calibration: Calibration
@@ -114,7 +121,7 @@ class CovarianceGroup:
     scale: int
 
     def photographs(self) -> Photographs:
-        """Prepare the photographs for the renderer, with the current calibration.
+        """Return the photographs for the renderer, with the current calibration. Nothing is rendered.
 
         They contain the room's light only if they have no lights of their own.
         """
@@ -129,10 +136,10 @@ class CovarianceGroup:
         return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
-        """Render what is added to direct light.
+        """Render the light that is added to direct light.
 
-        Returns (interreflection, room light), each linear radiance (n, H, W, 3). Either is zero if the fit does not use
-        it. `lit`, `coverage`: what `direct` returned.
+        Returns (interreflection, room light), each linear radiance (n, H, W, 3). Light that the fit does not use is 0.
+        `lit`, `coverage`: results of `direct`.
         """
         calibration, indirect = self.calibration, self.indirect
         bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
@@ -148,9 +155,9 @@ class CovarianceGroup:
 
 
 def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes: Equations) -> None:
-    """Compare the photographs in the group `at` with their predictions, and add them to the normal equations.
+    """Compare the photographs of the group `at` with their predictions, and add them to the normal equations.
 
-    Colour errors are added to `colours`, coverage errors to `silhouettes`.
+    Colours are added to `colours`, coverages to `silhouettes`. Both are changed in place.
     """
     problem, calibration, index = at.problem, at.calibration, at.index
     seen = problem.capture.observe(index, at.scale)

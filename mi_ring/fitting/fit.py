@@ -1,4 +1,4 @@
-"""A fit: sample, deform, render, compare, step (paper, section 3)."""
+"""The fit. Each iteration samples, deforms, renders, compares and steps (paper, section 3)."""
 
 import copy
 import time
@@ -48,11 +48,11 @@ class Fit(Renamed):
         for it in Fit(capture, Config.preset("fast")):
             print(it.number, it.loss)
 
-    `networks`: (Shape-Net, BRDF-Net) to train instead of the paper's, see `Flow` and `MaterialNet`. `terms`: of the
-    loss, by name, each a `Term` or a function of an `Iteration`; default: `default_terms`. `callbacks` are called with
-    each `Iteration` when it is done. `lighting`: what `choose_lighting` returned; needed unless the scene's own lights
-    are used. `state`: what `state()` of an interrupted fit returned, to continue it. A deterministic fit needs
-    `mi_ring.system.machine.set_threads(1)` beforehand.
+    `networks`: (Shape-Net, BRDF-Net) to train instead of the paper's, see `Flow` and `MaterialNet`. `terms`: terms of
+    the loss by name, each a `Term` or a function of an `Iteration`; default: `default_terms`. `callbacks`: functions
+    that are called with each `Iteration` when it is done. `state`: result of `state()` of an interrupted fit, to
+    continue it. `lighting`: result of `choose_lighting`; needed if `config.light` is not "capture". Call
+    `mi_ring.system.machine.set_threads(1)` before a deterministic fit.
 
     Raises InputError if capture, settings, terms and networks do not go together.
     """
@@ -89,7 +89,7 @@ class Fit(Renamed):
         self.optimisation.settle(self.schedule, self.iteration)
 
     def __iter__(self) -> Iterator[Iteration]:
-        """The iterations that are left, each when it is done."""
+        """Run the iterations that are left. Yields each iteration when it is done."""
         while self.iteration < self.iterations:
             yield self.step()
 
@@ -126,25 +126,25 @@ class Fit(Renamed):
         return it
 
     def evaluate(self, batch: Batch, observation: Observation) -> tuple[Tensor, Iteration]:
-        """The loss of a batch, with its autograd graph, and the iteration. Changes no state: a step may repeat it."""
+        """Predict a batch, and return (its loss with the autograd graph, iteration). It does not change the fit."""
         it = Iteration(batch, observation, self.renderer.predict(self.problem, self.model, batch), self.context())
         return self.loss(it), it
 
     def context(self) -> Context:
-        """Collect what terms of the loss and solvers may read at this iteration, besides batch and prediction."""
+        """Collect the parts of the fit that terms of the loss and solvers may read in this iteration."""
         config, one_material = self.problem.config, self.problem.lighting.one_material_until > 0
         return Context(config, self.capture, self.model, self.schedule, self.problem.exposure, one_material,
                        self.regulariser.strength(config.velocity_decay), self.renderer.autocast)  # fmt: skip
 
     def refine_masks(self) -> None:
-        """Segment the object again near the outline of the current surface, and replace the masks of the capture."""
+        """Find new masks near the outline of the current surface. They replace the masks in `capture` of this fit."""
         parts = self.capture, self.problem.exposure, self.model, self.renderer, self.schedule.final_level
         self.course.masks |= self.problem.processes.on_first(lambda: find_masks(*parts))
         self.capture = with_masks(self.problem.capture, self.course.masks)
 
     @property
     def ring(self) -> FittedObject:
-        """The object as fitted so far."""
+        """The fitted object, as it is after the last iteration. Further iterations change it."""
         return self.model.ring
 
     @property
@@ -154,35 +154,35 @@ class Fit(Renamed):
 
     @property
     def iterations(self) -> int:
-        """Number of all iterations."""
+        """Number of all iterations of this fit, done or not."""
         return self.schedule.iterations
 
     def calibrated(self) -> Capture:
-        """The capture with cameras, lights and response as refined so far."""
+        """Return the capture with the cameras, lights and camera response that the fit has found so far."""
         return self.model.calibrated(self.capture)
 
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
-        """Predict photograph `k` with the current model: (H, W, 3) linear radiance, at most `width` pixels wide.
+        """Render photograph `k` from the current model. Returns linear radiance (H, W, 3), at most `width` pixels wide.
 
-        `level`: of the mesh; `spp`: samples per pixel. Do not call it within a term of the loss: the term's backward
-        pass needs the renderer.
+        `level`: level of the mesh. `spp`: samples per pixel. Do not call it in a term of the loss: it would change the
+        surface that the term's backward pass needs.
         """
         return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 
     def result(self) -> FitResult:
-        """Collect what `mi_ring.output` needs to write the results."""
+        """Collect the results of the fit, for the functions of `mi_ring.output` that write them."""
         return result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
                          list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
 
     def save(self, folder: str | Path) -> None:
-        """Write `ring.pt`, `mesh.ply`, `scene.xml`, `report.html` and more into a folder; move earlier results aside.
+        """Write `ring.pt`, `mesh.ply`, `scene.xml`, `report.html` and other results into a folder.
 
-        Raises InputError if a file cannot be written, ValueError for networks that are not registered.
+        Earlier results are moved aside. Raises InputError if that fails, ValueError for networks without a name.
         """
         results.save(Path(folder), self.result())
 
     def state(self) -> dict[str, Any]:
-        """The state of the fit, for `torch.save`. `restore` of a `Fit` of the same capture continues from it."""
+        """Return a copy of the fit's state, for `torch.save`. A `Fit` of the same capture continues from it."""
         return copy.deepcopy({  # the next iteration changes it
             "ring": ring_state(self.ring, self.problem.config.settings()), "lighting": tuple(self.problem.lighting),
             "calibration": self.model.calibration and self.model.calibration.state_dict(),
@@ -190,7 +190,7 @@ class Fit(Renamed):
         })  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state`, which `state()` of a fit with the same networks and lighting returned."""
+        """Continue from `state`, the result of `state()` of a fit with the same networks and lighting."""
         if self.model.calibration:
             self.model.calibration.load_state_dict(state["calibration"])
         for name in PARTS:

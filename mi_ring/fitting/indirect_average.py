@@ -19,10 +19,11 @@ Averages: TypeAlias = dict[int, tuple[int, Tensor]]
 
 
 def averaged(earlier: Averages, new: GlobalIllumination, batch: Batch) -> tuple[GlobalIllumination, Averages]:
-    """Average the interreflection in the photographs of a batch over this and `earlier` iterations.
+    """Average the interreflection in the photographs of a batch over this iteration and earlier ones.
 
-    Returns (averaged interreflection of this process's photographs, updated averages by photograph). A rendering with
-    NaN or infinite pixels is left out.
+    `earlier`: averages of earlier iterations. `new`: light of this iteration. Returns (`new` with averaged
+    interreflection, new averages of the photographs in the batch). A picture with NaN or infinite pixels does not enter
+    the averages.
     """
     shown, averages = [], {}
     pictures = batch.share.gathered(torch.cat([new.radiance, new.alpha[..., None]], -1))

@@ -1,4 +1,4 @@
-"""One iteration of a fit, as terms of the loss, solvers and callbacks see it."""
+"""One iteration of a fit: the values that terms of the loss, solvers and callbacks read."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ from mi_ring.fitting.schedule import Schedule, Stage
 
 @dataclass(frozen=True)
 class Context:
-    """What terms of the loss and solvers may read, besides the batch, the observation and the prediction."""
+    """The parts of a fit that terms of the loss and solvers may read. Batch and prediction are in `Iteration`."""
 
     config: Config
     capture: Capture
@@ -34,7 +34,7 @@ class Context:
 class Iteration(renamed.Renamed):
     """One iteration: its batch, the observed photographs, the prediction and the loss.
 
-    Do not keep it: it uses much memory.
+    Do not store iterations: each uses much memory.
     """
 
     batch: Batch
@@ -54,7 +54,7 @@ class Iteration(renamed.Renamed):
 
     @property
     def progress(self) -> float:
-        """Share of the iterations that shape the surface, in [0, 1], that are done before this one."""
+        """Progress of the fit before this iteration, 0 to 1; 1 when the surface is fixed."""
         return self.batch.progress
 
     @property
@@ -63,23 +63,29 @@ class Iteration(renamed.Renamed):
         return self.batch.stage
 
     def object_pixels(self) -> Tensor:
-        """Find pixels (n, H, W) bool that show only the object, by the prediction and, if there is one, the mask."""
+        """Find the pixels that show only the object. Returns (n, H, W) bool.
+
+        The predicted coverage decides, together with the mask if there is one.
+        """
         return self.observation.surely(self.prediction.coverage.detach())
 
     def counted(self) -> Tensor | None:
-        """Pixels (n, H, W) bool that the colour loss compares. None: all pixels.
+        """Return the pixels (n, H, W) bool that the colour loss compares; None stands for all pixels.
 
-        In a lit room they are the object's pixels, because the background is bright there.
+        In a lit room only the object's pixels are compared, because the background is bright.
         """
         return self.object_pixels() if self.context.capture.lit_room else None
 
     def outline_blur(self) -> float:
-        """Standard deviation [px] of the Gaussian that blurs silhouettes in the mask loss."""
+        """Return the standard deviation [px] of the Gaussian that blurs silhouettes in the mask loss."""
         return self.context.schedule.outline_blur(self.progress, self.batch.size[0] / self.batch.scale)
 
     @torch.no_grad()
     def unexplained(self) -> float:
-        """Sum of absolute errors on the object, divided by the sum of observed radiance there; NaN if that is 0."""
+        """Return the sum of absolute errors on the object, divided by the sum of observed radiance on the object.
+
+        It is NaN if the observed radiance is 0.
+        """
         pixels = self.object_pixels()
         error = (self.prediction.rgb - self.observation.rgb)[pixels]
         error = torch.where(self.observation.clipped[pixels], error.clamp(max=0), error)

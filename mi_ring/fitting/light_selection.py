@@ -1,4 +1,4 @@
-"""Light selection: coarse fits find out what lights the photographs."""
+"""Light selection: coarse fits under several kinds of light find out which kind lights the photographs."""
 
 import math
 from dataclasses import replace
@@ -41,9 +41,10 @@ RECORDING = {unknown.option for unknown in UNKNOWNS.values() if unknown.changes 
 
 
 def choose_lighting(capture: Capture, config: Config) -> Lighting:
-    """Find the initial lighting that `Config.light` asks for. If lights are unknown, this runs coarse fits for minutes.
+    """Choose the lighting for a fit. If `Config.light` is "capture", it is the lights of the scene.
 
-    Raises InputError if nothing lights the object, or if the settings do not fit the capture.
+    Otherwise this runs coarse fits, which take minutes, and prints the result. Give the result to `Fit`. Raises
+    InputError if nothing lights the object, or if the settings contradict the capture.
     """
     if config.light == "capture":
         return Lighting.of(capture, config)
@@ -80,10 +81,10 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
 
 
 class CoarseFits:
-    """Runs coarse fits of a capture under candidate lightings, each at most once, and compares their errors."""
+    """Runs coarse fits of a capture under several lightings and compares their errors. No fit runs twice."""
 
     def __init__(self, capture: Capture, config: Config) -> None:
-        """Prepare coarse fits of a capture. `config`: of the fit for which the light is chosen."""
+        """Prepare coarse fits of a capture. No fit runs yet. `config`: settings of the fit that will use the light."""
         self.capture, self.config = capture, config
         self.center, _ = capture.sphere()
         self.errors: dict[Lighting, float] = {}  #: mean error of each
@@ -127,7 +128,7 @@ class CoarseFits:
         return min(lightings, key=self.error)
 
     def lamps(self) -> Lighting:
-        """Find the smallest number of lamps that explains the photographs well enough.
+        """Find the smallest number of lamps that explains the photographs well enough. Runs coarse fits.
 
         The lamps are either as far from the object as the cameras, or infinitely far.
         """
@@ -152,9 +153,10 @@ class CoarseFits:
         return bool((cosines < math.cos(math.radians(APART))).all())
 
     def brightest(self, count: int, distant: bool = False) -> Lighting:
-        """Place `count` lamps in the brightest directions of the estimated environment, scaled for an albedo of 0.5.
+        """Make a lighting of `count` lamps in the brightest directions of the environment that a coarse fit has found.
 
-        `distant`: are the lamps infinitely far?
+        Their strength is chosen so that the object's albedo is about 0.5. `distant`: the lamps are infinitely far;
+        otherwise they are as far from the object as the cameras.
         """
         self.error(Lighting("environment"))
         if self.environment is None:
@@ -167,9 +169,10 @@ class CoarseFits:
         return Lighting("lamps", lamps, distant)
 
     def with_material(self, lighting: Lighting) -> Lighting:
-        """Start with a uniform material under this lighting, if that explains the photographs about as well.
+        """Decide whether a fit under this lighting should begin with one material for the whole object.
 
-        Returns the better one of the two lightings, with the lamps that the coarse fit has estimated.
+        Runs a coarse fit with one material. If it explains the photographs about as well, the fit should. Returns the
+        lighting with this decision and with the lamps that the coarse fit has found.
         """
         one = lighting._replace(one_material_until=1.0)
         if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):
@@ -178,20 +181,22 @@ class CoarseFits:
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
-    """List the options of `Config.refine` that a coarse fit under `lighting` refines.
+    """List the options of `Config.refine` for a coarse fit under `lighting`. `config`: settings of the real fit.
 
-    They concern the camera response and the photographs' own lights.
+    A coarse fit refines the camera response. If the lights are those of the scene, it also refines these lights.
     """
     own = {*OWN_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
     return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDING, *own}) or ("none",)
 
 
 def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Approximate an environment by `count` distant lamps. Returns unit directions (count, 3) and colours (count, 3).
+    """Approximate an environment by `count` distant lamps. Returns (unit directions (count, 3), colours (count, 3)).
 
-    `harmonics` (PER_FRAME, 3): spherical harmonics of the environment. `certainty` (PER_FRAME,): information about
-    each. Colours are relative to the first lamp, which is white, because the object's colour is unknown. Least squares
-    with constant light; one direction after the other is moved to its optimum, until none moves.
+    `harmonics` (PER_FRAME, 3): spherical harmonics of the environment. `certainty` (PER_FRAME,): information about each
+    harmonic. Colours are relative to the first lamp; the first lamp is white, because the object's colour is unknown.
+
+    The method is weighted least squares with lamps and constant light. It moves one direction after the other to its
+    optimum, until none moves.
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
     seen = shown * harmonics
@@ -200,7 +205,7 @@ def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple
     grey = shown * np.eye(PER_FRAME)[:, :1]
 
     def fitted(chosen: list[int], colours: np.ndarray) -> tuple[np.ndarray, float]:
-        """Strengths (n + 1, C) of the lamps and of constant light, and the sum of squared residuals."""
+        """Return (strengths (n + 1, C) of the lamps and of constant light, sum of squared residuals)."""
         design = np.concatenate([lobes[:, chosen], grey], 1)
         solved = [nnls(design, colour) for colour in colours.T]
         return np.stack([strengths for strengths, _ in solved], 1), sum(rest**2 for _, rest in solved)

@@ -1,7 +1,7 @@
-"""The lighting of a fit: the lights of the scene, or unknown lights in their place.
+"""The lighting of a fit: the lights of the scene, or unknown lights that replace them.
 
-Photographs do not tell the brightness of an unknown light from the albedo. So the mean albedo is assumed to be about
-one half, in each colour.
+A brighter unknown light and a darker object give the same photographs. So the mean albedo of the object is assumed to
+be about one half, in each colour.
 """
 
 import math
@@ -26,7 +26,7 @@ Lamp: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]  #: `vector` and `
 
 
 class Lighting(NamedTuple):
-    """The initial lights of a fit, and assumptions about them; see `mi_ring.choose_lighting`."""
+    """The kind of light in a fit, the initial lamps, and assumptions; `mi_ring.choose_lighting` returns one."""
 
     kind: Kind  #: as `Config.light`, except "auto"
     lamps: tuple[Lamp, ...] = ()
@@ -35,10 +35,10 @@ class Lighting(NamedTuple):
 
     @classmethod
     def of(cls, capture: Capture, config: Config) -> "Lighting":
-        """Make the lighting from the lights in the scene file.
+        """Return the lighting for a fit with the lights of the scene file.
 
-        Raises InputError if the scene has no lights, or if the settings ask for unknown lights: `choose_lighting` finds
-        those.
+        Raises InputError if the scene has no lights. Also raises InputError if `config.light` is not "capture": then
+        `choose_lighting` must find the lights.
         """
         require_compatible(capture, config)
         if config.light != "capture":
@@ -47,15 +47,17 @@ class Lighting(NamedTuple):
         return cls("capture")
 
     def __str__(self) -> str:
-        """A name for people, for instance: environment, 1 lamp, 2 distant lamps."""
+        """Return a name for messages, for example: environment, 1 lamp, 2 distant lamps."""
         count = len(self.lamps)
         kind = f"{count} {'distant ' * self.distant}lamp{'s' * (count > 1)}" if count else self.kind
         return kind + " on one material" * (self.one_material_until > 0)
 
     def material_at(self, progress: float, material: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the material (V, …) to render at this progress: before `one_material_until` the mean of all vertices.
+        """Return the BSDF parameters (V, …) to render at this `progress` of the fit, 0 to 1.
 
-        Photographs hardly distinguish slow changes of albedo from slow changes of light. So the light explains both.
+        `material`: parameters of the V vertices by name. Before `one_material_until`, each vertex gets the mean of all
+        vertices, later its own parameters. Photographs hardly distinguish slow changes of the albedo along the surface
+        from slow changes of the light. At first, the light is to explain both.
         """
         if progress >= self.one_material_until:
             return material
@@ -63,7 +65,7 @@ class Lighting(NamedTuple):
 
 
 def require_compatible(capture: Capture, config: Config) -> None:
-    """Raise InputError if the capture, or another setting, contradicts the setting `Config.light`."""
+    """Raise InputError if `config.light` contradicts the capture or another setting."""
     others, own = shared_emitters(capture.scene), OWN_LIGHTS & set(config.refine)
     if config.light == "capture":
         if own and capture.photographs.dark:
@@ -92,14 +94,15 @@ def require_compatible(capture: Capture, config: Config) -> None:
 
 
 def is_unlit(capture: Capture) -> bool:
-    """Test whether the capture has no light at all: no light of any photograph, and no room light."""
+    """Test whether the capture has neither lights of photographs nor room light."""
     return capture.photographs.dark and capture.room is None
 
 
 def exposures(capture: Capture) -> np.ndarray:
-    """Strength (P, 3) of each photograph's own light, divided by the mean over photographs.
+    """Compute the relative exposures (P, 3) of the photographs, if all photographs have the same light.
 
-    If one light lights all photographs, these are their relative exposures.
+    They are the strengths of the photographs' own lights, divided by the mean strength. All are 1 if a light is black,
+    or if some lights are point lights and others distant.
     """
     strengths = capture.photographs.lights.rgb()
     kinds = capture.photographs.lights.is_finite()
@@ -109,10 +112,10 @@ def exposures(capture: Capture) -> np.ndarray:
 
 
 def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
-    """Return `lighting` with the lamps that a fit has estimated. `capture`: calibrated by that fit.
+    """Return `lighting` with the lamps that a fit has found. A lighting without lamps is returned unchanged.
 
-    All lamps are scaled so that the first one lights the object, at `center` (3,), as strongly as before. So the
-    assumed albedo stays valid.
+    `capture`: the calibrated capture of this fit. `center` (3,): centre of the object. All strengths are multiplied by
+    one factor, so that the first lamp lights the object as strongly as before and the assumed albedo stays valid.
     """
     if not lighting.lamps:
         return lighting
@@ -125,9 +128,10 @@ def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -
 
 
 def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
-    """Return the capture under other lights.
+    """Return the capture with the lights of `lighting`. With the kind "capture", it is returned unchanged.
 
-    Lamps after the first become lamps of the scene; an environment starts grey.
+    The first lamp becomes the light of each photograph, the others become lamps of the scene. An unknown environment is
+    grey at the start.
     """
     if lighting.kind == "capture":
         return capture
@@ -148,11 +152,11 @@ def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
 
 
 def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
-    """Convert the scene's environment map to spherical harmonics of the room, whose reflection has no noise.
+    """Convert the environment map of the scene to spherical harmonics: they are rendered without noise.
 
-    Returns (capture with that room, scene without the environment, its harmonics (BASIS, 3)). Without an environment
-    map, it returns the capture and its scene as they are, and None. So it does if a photograph has no mask, because its
-    background shows the environment, and for BSDFs other than `cooktorrance`.
+    Returns (capture whose `room` contains the harmonics, scene without the environment map, harmonics (BASIS, 3)).
+    Returns (the same capture, its scene, None) in three cases: the scene has no environment map; a photograph has no
+    mask, so that its background shows the environment map; the BSDF is not `cooktorrance`.
     """
     if not all(capture.masks.given) or not hasattr(capture.shape.bsdf(), "lobes"):
         return capture, capture.scene, None
@@ -164,6 +168,6 @@ def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray
 
 
 def room_frames(capture: Capture, lighting: Lighting) -> Collection[str]:
-    """The coordinate frames in which unknown room light is constant: "world", "camera", both or none."""
+    """Return the coordinate frames in which unknown room light does not change: "world", "camera" or both."""
     own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

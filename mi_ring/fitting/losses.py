@@ -1,4 +1,4 @@
-"""Losses as pure functions of tensors. All are means: their weights do not depend on the sizes of photographs."""
+"""Losses as pure functions of tensors. All are means, so that they do not depend on the size of photographs."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,10 @@ STEP = 0.02  #: of the Laplacian; small against the period of the encoding's hig
 
 
 def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
-    """Divide radiance by `exposure` and convert it to the scale of the colour loss `kind`; see `rgb_loss`."""
+    """Convert radiance of any shape to the scale on which the colour loss `kind` compares it; see `rgb_loss`.
+
+    `exposure`: mean radiance of the object. The radiance is first divided by it.
+    """
     linear = photographs / exposure
     if kind in ("l2", "l1"):
         return linear
@@ -23,10 +26,10 @@ def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
 def colour_error(
     predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, counted: Tensor | None = None
 ) -> Tensor:
-    """Difference (n, H, W, 3) of predicted and observed photographs (n, H, W, 3), after `perceived` of each.
+    """Compute the difference (n, H, W, 3) of predicted and observed photographs on the scale of `perceived`.
 
-    `clipped` (n, H, W, 3) bool: where the photograph is saturated, a brighter prediction is no error. `counted` (n, H,
-    W) bool: pixels to compare; elsewhere the error is 0. None: all pixels.
+    `clipped` (n, H, W, 3) bool: the photograph is saturated; a brighter prediction is no error there. `counted` (n, H,
+    W) bool: pixels to compare; in all others the error is 0. None: all pixels are compared.
     """
     error = perceived(predicted, exposure, kind) - perceived(observed, exposure, kind)
     error = torch.where(clipped, error.clamp(max=0), error)
@@ -36,10 +39,10 @@ def colour_error(
 def rgb_loss(
     predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, counted: Tensor | None = None
 ) -> Tensor:
-    """L_rgb: mean difference of predicted and observed photographs, with the arguments of `colour_error`.
+    """Compute L_rgb, the mean difference of predicted and observed photographs. Arguments: as for `colour_error`.
 
-    `kind`: `l2` squares the differences (the paper). `l1` takes absolute differences and is robust. `log` compares
-    ratios, so that dim surfaces at grazing angles count as much as bright ones. `l1+log` is the mean of both.
+    `kind`: "l2" squares the differences, as in the paper. "l1" takes absolute differences, which are less sensitive to
+    outliers. "log" compares ratios, so that dark surfaces count as much as bright ones. "l1+log" is the mean of both.
     """
     error = colour_error(predicted, observed, clipped, exposure, kind, counted)
     return error.square().mean() if kind == "l2" else error.abs().mean()
@@ -48,11 +51,12 @@ def rgb_loss(
 def mask_loss(
     coverage: Tensor, mask: Tensor, sigma: float, valid: Tensor | None = None, doubt: float = math.inf
 ) -> Tensor:
-    """Mean squared difference of coverage and mask (n, H, W), blurred by a Gaussian of `sigma` [px].
+    """Compute the mean squared difference of coverage (n, H, W) and mask (n, H, W), after a blur.
 
-    The blur gives an outline a gradient where it does not touch the mask yet. Pixels that are not `valid` (n, H, W)
-    count as equal. Differences above `doubt` count less and less, because the mask is probably wrong there
-    ("Statistical Methods for Tomographic Image Reconstruction", Geman and McClure 1987).
+    `sigma`: standard deviation of the Gaussian blur [px]. Because of the blur, an outline that does not touch the mask
+    has a gradient. `valid` (n, H, W): pixels that are compared; None: all. `doubt`: differences above it have a limited
+    influence, because the mask is probably wrong there ("Statistical Methods for Tomographic Image Reconstruction",
+    Geman and McClure 1987).
     """
     difference = coverage - mask if valid is None else (coverage - mask) * valid
     square = blur(difference, sigma).square()
@@ -60,9 +64,9 @@ def mask_loss(
 
 
 def velocity_loss(velocity: Callable[[Tensor], Tensor], x: Tensor, laplacian_scale: float) -> Tensor:
-    """L_reg = mean ‖(I − αΔ) V(x)‖² at points x (n, 3) on the paths of the flow; α = `laplacian_scale`.
+    """Compute L_reg = mean ‖(I − αΔ) V(x)‖² at points x (n, 3) of the flow. V: `velocity`. α: `laplacian_scale`.
 
-    The Laplacian over ℝ³ is computed by differences to six points at the distance `STEP`.
+    The Laplacian Δ is computed from differences to six points at the distance `STEP`.
     """
     offsets = STEP * torch.cat([torch.eye(3), -torch.eye(3)]).to(x)
     v = velocity(torch.cat([x[None], x + offsets[:, None]]))

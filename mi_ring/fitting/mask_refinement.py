@@ -1,4 +1,4 @@
-"""Mask refinement: during a fit, GrabCut finds the masks again, near the outline of the current surface."""
+"""Mask refinement: during a fit, GrabCut finds new masks near the outline of the current surface."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -28,10 +28,10 @@ Masks: TypeAlias = dict[int, Tensor]  #: (h, w) uint8, 0 or 1, perhaps of reduce
 
 
 def find_masks(capture: Capture, exposure: float, model: Model, renderer: Renderer, level: int) -> Masks:
-    """Segment the object in the photographs again, near the outline of the current surface: masks by photograph index.
+    """Segment the object in all photographs, near the outline of the current surface. Returns masks by photograph.
 
-    Implausible masks are left out. Photographs from one viewpoint share a mask. `exposure`: mean radiance of the
-    object. `level`: level of the mesh that is rendered.
+    A photograph whose new mask is implausible gets none. Photographs from one viewpoint share a mask. `exposure`: mean
+    radiance of the object. `level`: level of the mesh that is rendered.
     """
     capture = model.calibrated(capture)
     surface = renderer.show(model, level)
@@ -40,7 +40,10 @@ def find_masks(capture: Capture, exposure: float, model: Model, renderer: Render
         places.setdefault((shot.size, shot.camera.to_world.tobytes()), []).append(k)
 
     def seen_from(index: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Photographs `index` from one place: picture (h, w, 3), coverage (h, w), and sure background (h, w)."""
+        """Return (mean picture (h, w, 3), predicted coverage (h, w), certain background (h, w)).
+
+        `index`: the photographs from one viewpoint.
+        """
         scale = -(-max(capture.shots[index[0]].size) // LARGEST)
         seen = capture.observe(index, scale)
         _, coverage = prediction.draw(surface, capture.photograph(index[0], scale), spp=4, shadows=False)
@@ -65,7 +68,7 @@ def find_masks(capture: Capture, exposure: float, model: Model, renderer: Render
 
 
 def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
-    """Return a capture in which `masks`, from `find_masks`, replace the masks of the photographs with these indices."""
+    """Return a capture in which `masks`, from `find_masks`, replace the masks of their photographs."""
 
     def enlarged(mask: Tensor, size: tuple[int, int]) -> np.ndarray:
         (width, height), (rows, columns) = size, mask.shape

@@ -1,4 +1,4 @@
-"""The model of a fit: the fitted object and the calibration, all that is learned."""
+"""The model of a fit: everything that the fit learns, that is the fitted object and the calibration."""
 
 import math
 
@@ -15,7 +15,7 @@ from mi_ring.objects.fitted_object import FittedObject
 
 
 class Model(nn.Module):
-    """The unknowns of a fit: the object `ring`, and the `calibration` of the photographs (None: not refined)."""
+    """The unknowns of a fit: the object `ring` and the `calibration`, which is None if the fit refines none."""
 
     calibration: Calibration | None
 
@@ -36,19 +36,23 @@ class Model(nn.Module):
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 
     def fix_surface(self, fixed: bool) -> None:
-        """Freeze Shape-Net if `fixed`, otherwise train it. Parameters that were frozen at the start stay frozen."""
+        """Freeze the parameters of Shape-Net if `fixed`, otherwise let the optimiser train them.
+
+        Parameters that were frozen before the fit stay frozen.
+        """
         for parameter in self.to_freeze:
             parameter.requires_grad_(not fixed)
 
     def update_albedo(self) -> None:
-        """Scale the albedo's initial value inversely to the common factor `scale` of all lights.
+        """Divide the object's reflectances by the current value of `scale`, the common factor of all lights.
 
-        Without this, directly lit surfaces would change their brightness with `scale`.
+        Without this, the brightness of directly lit surfaces would change with `scale`. Does nothing if `scale` is not
+        refined.
         """
         if self.calibration and "scale" in self.calibration.refined:
             net, initial = self.ring.brdf_net, self.albedo / self.calibration.rig.power / math.pi
             net.set_parameters(net.bsdf_parameters, initial * self.calibration.albedo_factor)
 
     def calibrated(self, capture: Capture) -> Capture:
-        """Return the capture with the current estimates of cameras, lights and camera response."""
+        """Return `capture` with the current estimates of cameras, lights and camera response."""
         return self.calibration.applied(capture) if self.calibration else capture

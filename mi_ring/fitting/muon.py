@@ -1,4 +1,4 @@
-"""Muon: steps of orthogonalised momentum, for weight matrices."""
+"""The optimiser Muon for weight matrices. Its steps are orthogonalised momentum."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -15,9 +15,9 @@ MOMENTUM = 0.95
 
 
 class Muon(torch.optim.Optimizer):
-    """The optimiser `torch.optim.Muon` without weight decay. It orthogonalises in a `dtype` of your choice.
+    """The optimiser `torch.optim.Muon` without weight decay. `dtype`: number format of the orthogonalisation.
 
-    PyTorch's version always uses bfloat16, which most processors emulate: 20 times slower than float32.
+    PyTorch's version always uses bfloat16. Most processors emulate this format and need 20 times as long for it.
     """
 
     def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype) -> None:
@@ -46,7 +46,7 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalised(matrix: Tensor, dtype: torch.dtype) -> Tensor:
-    """Make a matrix approximately orthogonal: its singular values become 0.7 to 1.2."""
+    """Return an approximately orthogonal matrix: like `matrix`, but with singular values between 0.7 and 1.2."""
     a, b, c = COEFFICIENTS
     x = matrix.to(dtype)
     tall = x.shape[0] > x.shape[1]

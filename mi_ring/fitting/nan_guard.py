@@ -1,4 +1,4 @@
-"""A guard against NaN: it restores the last good parameters and lowers the learning rates."""
+"""A guard against NaN. It restores the last finite parameters and lowers the learning rates."""
 
 import copy
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ class NanGuard:
     def __init__(
         self, model: nn.Module, optimizers: Sequence[torch.optim.Optimizer], state: dict[str, Any] | None = None
     ) -> None:
-        """Copy the parameters, which must be finite. `state`: what `state()` of an interrupted fit returned."""
+        """Copy the parameters, which must be finite. `state`: result of `state()`, to continue an interrupted fit."""
         self.model, self.optimizers = model, optimizers
         self.factor: float = 1.0  #: of all learning rates
         self.retreats: int = 0  #: how often the copy was restored
@@ -29,7 +29,7 @@ class NanGuard:
 
     @torch.no_grad()
     def finite(self) -> bool:
-        """Are all parameters, buffers and optimiser states finite?"""
+        """Test whether all parameters, buffers and optimiser states are finite."""
         numbers = [*self.model.parameters(), *self.model.buffers()]
         numbers += [t for o in self.optimizers for state in o.state.values() for t in state.values()]
         tensors = [t for t in numbers if torch.is_tensor(t) and t.is_floating_point() and t.numel()]
@@ -38,8 +38,8 @@ class NanGuard:
     def note(self, healthy: bool) -> bool:
         """Record an iteration. After repeated failures, or if the model is not finite, restore the last copy.
 
-        `healthy`: loss and gradients were finite, and the optimisers have made their steps. Returns False after too
-        many restorations; the fit has then diverged.
+        Makes a new copy from time to time. `healthy`: loss and gradients were finite, and the optimisers have made
+        their steps. Returns False if it has restored a copy too often; then the fit has diverged.
         """
         self.failures = 0 if healthy else self.failures + 1
         if self.failures < PATIENCE and self.finite():
@@ -53,13 +53,10 @@ class NanGuard:
         return self.retreats <= RETREATS
 
     def keep(self) -> None:
-        """Copy parameters and optimiser states. They must be finite now."""
+        """Copy the parameters and the optimiser states, which must be finite. The copy replaces the last one."""
         parts: list[Any] = [self.model, *self.optimizers]
         self.copy, self.steps = copy.deepcopy([part.state_dict() for part in parts]), 0
 
     def state(self) -> dict[str, Any]:
-        """Return the guard's counters for a checkpoint.
-
-        A copy is not saved, because the checkpoint itself is finite.
-        """
+        """Return the guard's counters, for a checkpoint. The copy is left out: the checkpoint itself is finite."""
         return {"factor": self.factor, "retreats": self.retreats, "failures": self.failures}

@@ -1,4 +1,4 @@
-"""The optimisation: Muon for hidden weights, Adam for the rest, and one guarded step of all."""
+"""The optimisation: Muon for hidden weights, Adam for all other parameters, and one step of all optimisers."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -28,7 +28,8 @@ CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one ma
 def network_steppers(networks: nn.Module, config: Config, device: torch.device) -> list[Stepper]:
     """Make the optimisers of both networks: Muon for hidden weight matrices and Adam for the rest, or only Adam.
 
-    Hidden layers are the linear layers in an attribute `hidden`, an `nn.ModuleList`, of a network or of its submodules.
+    A layer is hidden if it is a linear layer in an `nn.ModuleList` that is the attribute `hidden` of a network or of
+    one of its submodules.
     """
     lists = [getattr(part, "hidden", None) for part in networks.modules()]
     layers = [layer for some in lists if isinstance(some, nn.ModuleList) for layer in some]
@@ -44,7 +45,7 @@ def network_steppers(networks: nn.Module, config: Config, device: torch.device) 
 
 
 def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepper]:
-    """Make the optimisers of the calibration: Adam for the unknowns that no solver estimates."""
+    """Make the optimisers of the calibration: Adam for the unknowns that no solver estimates. May return []."""
     groups = calibration.parameters_without_solver()
     if not groups:
         return []
@@ -54,9 +55,9 @@ def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepp
 
 @torch.no_grad()
 def solve_room(calibration: Calibration, it: Iteration) -> None:
-    """Add the photographs of an iteration to the normal equations of the room's light, and solve for its harmonics.
+    """Estimate the room's light, in place: add an iteration's photographs to the normal equations and solve them.
 
-    Does nothing before it is time to refine the room's light.
+    Does nothing if the room's light is not refined, or not yet.
     """
     other, seen, batch = it.prediction.other_light, it.observation, it.batch
     if other is None or not calibration.solves_room(it.progress):
@@ -67,10 +68,10 @@ def solve_room(calibration: Calibration, it: Iteration) -> None:
 
 
 class Optimisation:
-    """The optimisers of a model with their learning rates, the solvers of calibration, and the guard against NaN."""
+    """The optimisers of a model, their learning rates, the solvers of calibration and the guard against NaN."""
 
     def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
-        """Make optimisers and solvers for a model. `terms`: of the loss, by name."""
+        """Make the optimisers and solvers for a model. `terms`: the terms of the loss by name."""
         self.problem, self.model = problem, model
         self.steppers = network_steppers(model.ring, problem.config, problem.device)
         self.solvers: list[ExposureSolver | PoseSolver] = []  #: use more of an iteration than gradients
@@ -84,11 +85,11 @@ class Optimisation:
         self.guard = NanGuard(model, self.optimizers)
 
     def step(self, evaluate: Callable[[], tuple[Tensor, Iteration]]) -> Iteration:
-        """Evaluate the loss of an iteration, backpropagate, and step all optimisers. Returns the iteration.
+        """Evaluate the loss, backpropagate it, and make one step of all optimisers. Returns the iteration.
 
-        Optimisers may call `evaluate` several times. No optimiser steps if loss or gradients are not finite, or if no
-        term of the loss applies, for instance only `mask` to photographs without masks. Raises InputError if the fit
-        diverges.
+        `evaluate`: returns (loss, iteration); optimisers may call it several times. No step is made if loss or
+        gradients are not finite, or if the loss has no term for these photographs, for example if its only term is
+        `mask` and they have no masks. Raises InputError if the fit diverges.
         """
         loss, it = evaluate()
         if self.model.calibration:
@@ -119,9 +120,9 @@ class Optimisation:
         return it
 
     def settle(self, schedule: Schedule, iteration: int) -> None:
-        """Freeze the surface if `iteration` is in the settling stage, otherwise let it move.
+        """Freeze the surface if `iteration`, counted from 0, is in the settling stage; otherwise let it move.
 
-        When the settling stage begins, the normal equations of the room's light start anew.
+        In the first iteration of the settling stage, this also empties the normal equations of the room's light.
         """
         fixed = schedule.shaping <= iteration < schedule.iterations
         self.model.fix_surface(fixed)
@@ -130,7 +131,10 @@ class Optimisation:
             self.guard.keep()  # so that a retreat does not restore the old equations
 
     def backward(self, loss: Tensor, it: Iteration) -> float:
-        """Backpropagate the loss, and sum the gradients over all processes. Returns the loss of all processes."""
+        """Backpropagate this process's `loss`, and sum the gradients over all processes.
+
+        Returns the loss of all processes together.
+        """
         processes = self.problem.processes
         for optimizer in self.optimizers:
             optimizer.zero_grad()
@@ -144,15 +148,15 @@ class Optimisation:
 
     @property
     def learning_rate(self) -> float:
-        """The current learning rate of the first optimiser, Adam's for the networks."""
+        """The current learning rate of the first optimiser, which is Adam for the networks."""
         return self.optimizers[0].param_groups[0]["lr"]
 
     def state(self) -> dict[str, Any]:
-        """Collect what a checkpoint needs."""
+        """Return the states of the optimisers and of the guard, for a checkpoint."""
         return {"optimizers": [o.state_dict() for o in self.optimizers], "guard": self.guard.state()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state()`. The model must have been restored before."""
+        """Continue from `state`, a result of `state()`. The model must have been restored before."""
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
             optimizer.load_state_dict(saved)
         self.guard = NanGuard(self.model, self.optimizers, state["guard"])

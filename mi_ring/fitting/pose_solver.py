@@ -1,9 +1,9 @@
-"""Solves for the poses of cameras by Gauss-Newton, from how a picture moves with its camera.
+"""Solves for the poses of cameras by Gauss-Newton steps. They divide the gradient of the loss by its curvature.
 
-An iteration sees few photographs, and a fit sees each of them a few dozen times. Adam's steps do not depend on the size
-of an error: they move correct cameras away, or arrive too late. The gradient is that of the loss. This module computes
-the curvature to divide it by. This is direct image alignment, as in "Lucas-Kanade 20 Years On" (Baker and Matthews,
-IJCV 2004), with the surface in place of a template.
+A fit sees each photograph a few dozen times. Adam's steps do not depend on the size of an error: they move correct
+cameras away, or are too short for wrong ones. This module computes the curvature from the motion of a picture's pixels
+with its camera. This is direct image alignment, as in "Lucas-Kanade 20 Years On" (Baker and Matthews, IJCV 2004). The
+surface takes the place of the template.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,10 @@ NEAR, FAR = 0.2, 0.4  #: progress at which steps begin, for a start near the obj
 
 
 def slopes(picture: Tensor) -> Tensor:
-    """Image gradient of a picture (H, W, C) by central differences: (H, W, C, 2), to the right and down."""
+    """Compute the image gradient of a picture (H, W, C) by central differences.
+
+    Returns (H, W, C, 2): derivatives to the right and downward.
+    """
     padded = F.pad(picture.movedim(-1, 0), (1, 1, 1, 1), mode="replicate")
     right = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
     down = padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
@@ -38,12 +41,13 @@ def slopes(picture: Tensor) -> Tensor:
 
 
 def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: float) -> Tensor:
-    """Jacobian (H, W, 2, 6) of pixel positions [px; right, down] on a sphere with respect to the camera's pose.
+    """Compute how points of a sphere move in the picture if the camera moves: a Jacobian (H, W, 2, 6) per pixel.
 
-    The six columns: rotation [rad] about each axis of the camera, then translation [scene units] along each (Mitsuba's
-    axes). `intrinsics` (4,): fx, fy, cx, cy [px], without distortion. `size`: (width, height) of the picture. `center`
-    (3,), `radius`: the sphere, in camera coordinates; smaller if the camera is inside. A ray that misses the sphere
-    gets the depth of its point nearest to the sphere.
+    The two rows are the motion to the right and downward [px]. The six columns are the rotation [rad] about each of the
+    camera's axes and the translation [scene units] along each of them (Mitsuba's axes). `intrinsics` (4,): fx, fy, cx,
+    cy [px], without distortion. `size`: (width, height) of the picture [px]. `center` (3,), `radius`: the sphere, in
+    camera coordinates; it is made smaller if the camera is inside. The point of a ray that misses the sphere is the
+    point of the ray that is nearest to the sphere.
     """
     width, height = size
     fx, fy, cx, cy = intrinsics
@@ -66,15 +70,16 @@ def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: fl
 
 
 class PoseSolver(torch.optim.Optimizer):
-    """Estimates camera poses, the unknowns `turn` and `move`, by Gauss-Newton.
+    """Estimates camera poses, the unknowns `turn` and `move`, by Gauss-Newton steps.
 
-    Call `look` with an iteration, then `step`.
+    Call `look` in each iteration, then `step`.
     """
 
     def __init__(self, calibration: Calibration, near: bool, terms: Mapping[str, Term]) -> None:
-        """Solve for the poses of a calibration. `near`: the fit starts near the object. `terms`: of the loss.
+        """Prepare to solve for the poses of a calibration.
 
-        Raises InputError if `rgb` or `mask` is not the default term: the curvature is that of the default ones.
+        `near`: the fit starts near the object, so that steps can begin early. `terms`: the terms of the loss by name.
+        Raises InputError if `rgb` or `mask` is not the default term: `curvature` holds only for the default terms.
         """
         for name in "rgb", "mask":
             if terms.get(name, default_terms[name]) is not default_terms[name]:
@@ -85,14 +90,14 @@ class PoseSolver(torch.optim.Optimizer):
         self.seen: tuple[Tensor, Tensor] | None = None  #: photographs and their curvature
 
     def look(self, it: Iteration) -> None:
-        """Store the photographs of an iteration and the Gauss-Newton Hessian of its loss."""
+        """Store the photographs of an iteration and the Gauss-Newton Hessian of its loss, for `step`."""
         self.seen = None
         if it.progress >= self.rate.start:
             self.seen = torch.from_numpy(it.batch.all_photographs), it.batch.share.gathered(curvature(it))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Make one Gauss-Newton step with the current gradients. Does nothing before refinement begins."""
+        """Change the poses of the stored photographs by a Gauss-Newton step. Does nothing before refinement begins."""
         (group,) = self.param_groups
         turn, move = group["params"]
         if self.seen is None or turn.grad is None:
@@ -109,10 +114,11 @@ class PoseSolver(torch.optim.Optimizer):
 
 @torch.no_grad()
 def curvature(it: Iteration) -> Tensor:
-    """Gauss-Newton Hessian (n, 6, 6) of an iteration's loss by the pose (`turn`, `move`) of each photograph.
+    """Compute the Gauss-Newton Hessian (n, 6, 6) of an iteration's loss with respect to each photograph's pose.
 
-    It contains colours, silhouettes and prior, and takes the surface as a sphere. Absolute differences are treated by
-    iteratively reweighted least squares; those below the mean get the weight of the mean.
+    The pose is (`turn`, `move`) [standard deviations of the priors]. The Hessian contains colours, silhouettes and
+    prior. It approximates the surface by a sphere. Absolute differences are treated by iteratively reweighted least
+    squares; those below the mean get the weight of the mean.
     """
     context, seen, prediction = it.context, it.observation, it.prediction
     calibration, (n, height, width) = context.model.calibration, prediction.coverage.shape

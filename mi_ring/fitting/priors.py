@@ -1,7 +1,7 @@
-"""Priors on shape and material, as terms of the loss; all but `settling` are off by default.
+"""Priors on shape and material, as terms of the loss. All but `settling` are off by default.
 
-The paper names TV-L1 for the shape, and L1 and low rank for the BRDF; these are priors of that kind. None depends on
-the resolution of the mesh or on the units of the scene.
+The paper names such priors: TV-L1 for the shape, L1 and low rank for the BRDF. The priors here do not depend on the
+resolution of the mesh or on the units of the scene.
 """
 
 import math
@@ -19,11 +19,12 @@ EPS = 1e-3  #: least mean to divide by, and least distance of a share from 0 and
 
 
 def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
-    """Total variation of the normals of a closed mesh, vertices (V, 3) and faces (F, 3): a length.
+    """Compute the total variation of the normals of a closed mesh: vertices (V, 3), faces (F, 3). It is a length.
 
-    The sum over all edges of their length times the distance between the normals of both sides ("Discrete total
-    variation of the normal vector field as shape prior", Bergmann et al., Inverse Problems 2020; chords instead of
-    angles). A sharp bend costs about as much as a round one, and ripples cost more. 8πR for a sphere of even triangles.
+    It is a sum over all edges: the length of the edge times the distance between the normals of the two triangles at it
+    ("Discrete total variation of the normal vector field as shape prior", Bergmann et al., Inverse Problems 2020;
+    chords instead of angles). A sharp bend costs about as much as a round one, and ripples cost more. A sphere of
+    radius R and even triangles has 8πR.
     """
     pairs, ends = trimesh.graph.face_adjacency(faces, return_edges=True)
     a, b, c = vertices[torch.as_tensor(faces, device=vertices.device)].unbind(1)
@@ -33,9 +34,10 @@ def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
 
 
 def variation_of_values(vertices: Tensor, faces: np.ndarray, values: Tensor) -> Tensor:
-    """Total variation of values (V, C), linear on each triangle of a mesh, divided by its area; summed over channels.
+    """Compute the total variation of values (V, C) on a mesh, divided by the area of the mesh. Sums over channels.
 
-    It is the mean length of the surface gradient, per unit of length of `vertices` (V, 3). `faces`: (F, 3).
+    This is the mean length of the surface gradient, per unit of length. The mesh: `vertices` (V, 3), `faces` (F, 3).
+    The values are linear on each triangle.
     """
     corners = torch.as_tensor(faces, device=vertices.device)
     a, b, c = vertices[corners].unbind(1)
@@ -47,11 +49,11 @@ def variation_of_values(vertices: Tensor, faces: np.ndarray, values: Tensor) -> 
 
 
 def number_of_bases(values: Tensor) -> Tensor:
-    """Smooth measure of the rank of M, `values` (V, C): nuclear norm over Frobenius norm, ‖M‖₁ / ‖M‖₂.
+    """Measure the rank of a matrix M = `values` (V, C) smoothly, by nuclear norm over Frobenius norm, ‖M‖₁ / ‖M‖₂.
 
-    It is 1 if all rows are multiples of one basis material, √k for k orthogonal bases of equal strength, and at most
-    √C. The nuclear norm is the convex relaxation of the rank (Fazel 2002). The division keeps it from darkening the
-    material.
+    The result is 1 if all rows are multiples of one basis material, √k for k orthogonal bases of equal strength, and at
+    most √C. The nuclear norm is the convex relaxation of the rank (Fazel 2002). Because of the division, a darker
+    material does not cost less.
     """
     return torch.linalg.matrix_norm(values, "nuc") / values.norm()
 
@@ -59,7 +61,7 @@ def number_of_bases(values: Tensor) -> Tensor:
 def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
     """Arrange the material parameters of V points as a matrix (V, C) of numbers near 1.
 
-    Parameters without upper bound are divided by BRDF-Net's `scale`; others become a share of their range.
+    A parameter without upper bound is divided by BRDF-Net's `scale`. Another parameter becomes a share of its range.
     """
     columns = []
     for p in brdf_net.bsdf_parameters:
@@ -69,17 +71,20 @@ def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
 
 
 def normal_variation(it: Iteration) -> Tensor:
-    """The term `normal_variation`: total variation of the normals, relative to a sphere of the object's size."""
+    """Compute the term `normal_variation`: the total variation of the normals, divided by that of a sphere.
+
+    The sphere has the radius of the normalising sphere.
+    """
     radius = it.context.model.ring.radius
     return variation_of_normals(it.prediction.vertices, it.batch.faces) / (8 * math.pi * radius)
 
 
 def albedo_variation(it: Iteration) -> Tensor:
-    """The term `albedo_variation`: mean surface gradient of the material, times the object's radius.
+    """Compute the mean length of the surface gradient of the material, times the object's radius, for `settling`.
 
     Reflectances are divided by their mean, because half the reflectance in twice the light looks the same. A parameter
-    with an upper bound (a roughness) counts by its logit: as a share it would vary less near its bounds. The shape gets
-    no gradient.
+    with an upper bound, such as a roughness, is replaced by its logit; its share of the range would vary less near the
+    bounds. The shape gets no gradient.
     """
     ring, prediction = it.context.model.ring, it.prediction
     values = columns_of(prediction.material, ring.brdf_net)
@@ -89,5 +94,5 @@ def albedo_variation(it: Iteration) -> Tensor:
 
 
 def material_rank(it: Iteration) -> Tensor:
-    """The term `material_rank`: the number of basis materials at all vertices."""
+    """Compute the term `material_rank`: a smooth measure of the number of basis materials; see `number_of_bases`."""
     return number_of_bases(columns_of(it.prediction.material, it.context.model.ring.brdf_net))

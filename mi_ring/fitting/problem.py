@@ -1,4 +1,4 @@
-"""The problem that a fit solves: photographs, their lights, and settings. It does not change during the fit."""
+"""The problem that a fit solves: photographs, lights and settings. It does not change during the fit."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from mi_ring.system.machine import device
 
 @dataclass(frozen=True)
 class Problem:
-    """A capture with the lights that a fit assumes, and the settings of the fit."""
+    """A capture, the lights that a fit assumes, and the settings of the fit."""
 
     given: Capture  #: the capture as it was handed in, with photographs of any size
     capture: Capture  #: lit by `lighting`
@@ -48,9 +48,10 @@ class Problem:
 
 
 def held_out_photographs(capture: Capture, every: int) -> np.ndarray:
-    """Choose the validation photographs: every n-th, n = `every`, from index n // 2 on.
+    """Choose the photographs that are held out of the fit: every n-th from index n // 2 on, with n = `every`.
 
-    Returns indices; none if n is 0. Raises InputError if no photograph or all photographs would be held out.
+    Returns their indices. If n is 0, no photograph is held out. Raises InputError if n > 0 and no photograph, or every
+    photograph, would be held out.
     """
     several = len(capture)
     found = np.arange(several)[every // 2 :: every] if every else np.arange(0)

@@ -1,9 +1,9 @@
 """Data parallelism: the processes that `torchrun` starts share the work of each iteration.
 
-All processes draw the same random numbers, hold the same networks and make the same steps. Each evaluates the networks
-at a part of the points and renders a part of the photographs. Sums go over all processes (synchronous data parallelism,
-"Accurate, Large Minibatch SGD", Goyal et al. 2017). Only the first process writes and prints. No other module uses
-torch.distributed.
+All processes draw the same random numbers, hold the same networks and make the same steps. Each process evaluates the
+networks at some of the points and renders some of the photographs. Losses and gradients are summed over all processes
+(synchronous data parallelism, "Accurate, Large Minibatch SGD", Goyal et al. 2017). Only the first process writes and
+prints. No other module uses torch.distributed.
 """
 
 import atexit
@@ -25,11 +25,11 @@ Value = TypeVar("Value")
 
 
 class ProcessLost(InputError):
-    """Another process of the fit has ended or cannot be reached. No results are written."""
+    """Error: another process of the fit has ended or cannot be reached. No results are written then."""
 
 
 class Processes:
-    """The processes of a fit, seen from one of them. This class is a single process: its sums are the totals."""
+    """Communication between the processes of a fit. This class is for a fit with one process: it sends nothing."""
 
     count, rank = 1, 0  #: number of processes, and the number of this one
     on_this_machine = 1  #: processes on this machine
@@ -37,23 +37,26 @@ class Processes:
 
     @property
     def threads(self) -> int:
-        """Processor threads for this process."""
+        """Number of processor threads for this process."""
         return max(1, cores() // self.on_this_machine)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """Sum a tensor over all processes. Each process gets the result. The tensors must have one shape."""
+        """Sum a tensor over all processes. Returns the sum in each process. All tensors must have the same shape."""
         return tensor
 
     def broadcast(self, value: Value) -> Value:
-        """Return the `value` of the first process, in all processes. It is sent by pickle."""
+        """Return the first process's `value` in all processes. The value must be picklable."""
         return value
 
     def agreed(self, work: Callable[[], Value]) -> Value:
-        """Call `work` in each process and return its result. An InputError in one process is raised in all."""
+        """Call `work` in each process. Returns this process's result. An InputError in one process is raised in all."""
         return work()
 
     def on_first(self, work: Callable[[], Value]) -> Value:
-        """Call `work` in the first process only. Its result, InputError or SystemExit reaches all processes."""
+        """Call `work` in the first process only. Returns its result in all processes.
+
+        An InputError or SystemExit of `work` is raised in all processes.
+        """
         return work()
 
     def maximum(self, number: int) -> int:
@@ -61,18 +64,18 @@ class Processes:
         return number
 
     def barrier(self) -> None:
-        """Wait until all processes have called this."""
+        """Wait until all processes have called this method."""
 
     def share(self, total: int) -> "Share":
-        """Return the part of `total` photographs or points that this process works on."""
+        """Return this process's share of `total` photographs or points."""
         return Share(self, total)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """Replace each parameter's gradient by the sum over all processes; None where no process has one."""
+        """Replace the gradient of each parameter by its sum over all processes; None if no process has a gradient."""
 
 
 class Team(Processes):
-    """One of several processes, connected by torch.distributed."""
+    """Communication between several processes, by torch.distributed."""
 
     def __init__(self) -> None:
         import torch.distributed as distributed
@@ -87,12 +90,12 @@ class Team(Processes):
         atexit.register(self.leave)
 
     def leave(self) -> None:
-        """Leave the process group, when the process ends. A process cannot join a group twice."""
+        """Leave the process group. The end of the process calls this; a process cannot join a group twice."""
         with contextlib.suppress(RuntimeError):
             self.distributed.destroy_process_group()
 
     def attempt(self, exchange: Callable[[], None]) -> None:
-        """Call `exchange`. Raises ProcessLost if another process is gone."""
+        """Call `exchange`, which communicates with other processes. Raises ProcessLost if one of them is gone."""
         try:
             exchange()
         except RuntimeError as error:
@@ -100,7 +103,7 @@ class Team(Processes):
                               "checkpoint with the same command and --resume") from error  # fmt: skip
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """See `Processes`."""
+        """Return the sum of a tensor over all processes; see `Processes.sum`."""
         place = device() if self.nccl else torch.device("cpu")
         total = tensor.detach().to(place, copy=True).contiguous()
         self.exchanged, self.exchanges = self.exchanged + total.numel() * total.element_size(), self.exchanges + 1
@@ -108,13 +111,16 @@ class Team(Processes):
         return total.to(tensor.device)
 
     def broadcast(self, value: Value) -> Value:
-        """See `Processes`."""
+        """Return the first process's `value` in all processes. It is sent by pickle."""
         box = [pickle.dumps(value) if self.rank == 0 else None]
         self.attempt(lambda: self.distributed.broadcast_object_list(box))
         return value if self.rank == 0 else pickle.loads(box[0])  # type: ignore[arg-type]
 
     def agreed(self, work: Callable[[], Value]) -> Value:
-        """See `Processes.agreed`. If several processes fail, the message of the first of them is used."""
+        """Call `work` in each process. If it fails in one process, all raise InputError; see `Processes.agreed`.
+
+        If it fails in several processes, all raise the message of the first of them.
+        """
         result: Any = None
         error: InputError | None = None
         try:
@@ -130,7 +136,7 @@ class Team(Processes):
         return result
 
     def on_first(self, work: Callable[[], Value]) -> Value:
-        """See `Processes`."""
+        """Call `work` in the first process only. Returns its result in all processes; see `Processes.on_first`."""
         outcome: Any = None
         try:
             outcome = ("value", work()) if self.rank == 0 else None
@@ -146,17 +152,17 @@ class Team(Processes):
         return value
 
     def maximum(self, number: int) -> int:
-        """See `Processes`."""
+        """Return the largest `number` of all processes."""
         numbers = torch.tensor([number])
         self.attempt(lambda: self.distributed.all_reduce(numbers, self.distributed.ReduceOp.MAX))
         return int(numbers)
 
     def barrier(self) -> None:
-        """See `Processes`."""
+        """Wait until all processes have called this method."""
         self.maximum(0)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """See `Processes`. All gradients go in one exchange."""
+        """Replace the gradients by their sums over all processes. All gradients are sent together."""
         place = device()
         has = torch.tensor([float(p.grad is not None) for p in parameters])
         grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
@@ -169,12 +175,12 @@ class Team(Processes):
 class Rows(torch.autograd.Function):
     """Autograd function that joins the rows of all processes to one tensor (N, C).
 
-    Gradients are summed over processes.
+    The backward pass sums the gradients over all processes.
     """
 
     @staticmethod
     def forward(ctx: Any, own: Tensor, share: "Share") -> Tensor:
-        """See `Share.gathered`."""
+        """Return `share.gathered(own)`: the rows of all processes."""
         ctx.share = share
         return share.gathered(own)
 
@@ -185,10 +191,10 @@ class Rows(torch.autograd.Function):
 
 
 class Share:
-    """The part of an iteration's photographs (or points) that one process works on: the slice `part`.
+    """This process's share of an iteration's photographs or points. The slice `part` selects it.
 
-    With more processes than photographs some have `weight` 0. They render a photograph of another process, which does
-    not count.
+    If there are more processes than photographs, some processes have the `weight` 0. They render a photograph of
+    another process, and their result does not count.
     """
 
     def __init__(self, processes: Processes, total: int) -> None:
@@ -198,14 +204,17 @@ class Share:
         self.part = slice(first, last) if last > first else slice(min(first, total - 1), min(first, total - 1) + 1)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """Sum over all processes a `tensor` that this process has summed over its own photographs.
+        """Sum a tensor over all processes. Returns the sum without gradients.
 
-        Without gradients.
+        `tensor`: this process's sum over its own photographs.
         """
         return self.processes.sum(tensor if self.weight else torch.zeros_like(tensor))
 
     def gathered(self, tensor: Tensor) -> Tensor:
-        """Join the rows (n, …) of all processes to (N, …), in the order of the N photographs. Without gradients."""
+        """Join the rows of all processes. Returns (N, …) in the order of the N photographs, without gradients.
+
+        `tensor` (n, …): the rows of this process's photographs.
+        """
         if self.processes.count == 1:
             return tensor
         whole = tensor.new_zeros(self.total_count, *tensor.shape[1:])
@@ -214,7 +223,7 @@ class Share:
         return self.processes.sum(whole)
 
     def concatenated(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Join tensors (n, …) of each process's points to tensors (N, …) of all points. With gradients."""
+        """Join each process's tensors (n, …) for its points. Returns tensors (N, …) for all points, with gradients."""
         if self.processes.count == 1:
             return list(tensors)
         columns = [tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None] for tensor in tensors]
@@ -227,13 +236,13 @@ _current: Processes = ALONE
 
 
 def current() -> Processes:
-    """Return the processes of the current fit: inside `joined` the whole team, elsewhere a single process."""
+    """Return the processes of the current fit: the team inside of `joined`, a single process elsewhere."""
     return _current
 
 
 @functools.cache
 def team_of_this_process() -> Team:
-    """Return the team of processes to which this process belongs. The first call connects them."""
+    """Return the team of processes to which this process belongs. The first call connects the processes."""
     return Team()
 
 
@@ -241,8 +250,8 @@ def team_of_this_process() -> Team:
 def joined() -> Iterator[Processes]:
     """Context manager in which the processes that `torchrun` has started work on one fit.
 
-    A process that torchrun has not started works alone. Only the first process prints. It also reports an InputError;
-    the others then end silently.
+    Yields the communication between them. A process that `torchrun` has not started works alone. Only the first process
+    prints. If an InputError ends the fit, only the first process reports it.
     """
     global _current
     if int(os.environ.get("WORLD_SIZE", 1)) == 1 or "TORCHELASTIC_RUN_ID" not in os.environ:
@@ -262,6 +271,6 @@ def joined() -> Iterator[Processes]:
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Context manager that discards printed text."""
+    """Context manager that discards all text printed in its block, also to standard error."""
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
         yield

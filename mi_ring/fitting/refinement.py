@@ -1,4 +1,4 @@
-"""Which unknowns of calibration a fit refines, and when."""
+"""Decides which unknowns of calibration a fit refines."""
 
 import math
 from typing import NamedTuple
@@ -22,7 +22,7 @@ START = 0.2  #: progress of the fit at which refinement begins
 
 
 class Refinement(NamedTuple):
-    """What a fit refines, and how bright object and lights are at its start."""
+    """What a fit refines, and how bright the object and the lights are before the first iteration."""
 
     reflectance: float  #: of the object, according to the lights' intensities
     refined: tuple[str, ...]  #: options of `--refine`
@@ -30,10 +30,10 @@ class Refinement(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, center: np.ndarray) -> "Refinement":
-        """Decide what to refine, by the settings and by what the capture says about itself.
+        """Decide what to refine, from the settings and the capture. `center` (3,): centre of the object.
 
-        `center` (3,): of the object. Only if the light scale is refined, `power` differs from 1: it is the factor of
-        all lights that gives the object a usual albedo.
+        `power` is 1 unless `scale` is refined and the lights of the capture are impossibly weak. Then it is the factor
+        of all lights that gives the object a usual albedo.
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo = math.pi * reflectance
@@ -42,14 +42,14 @@ class Refinement(NamedTuple):
 
     @property
     def albedo(self) -> float:
-        """Albedo of the object that follows from the lights' intensities. If it is above 1, these cannot be true."""
+        """Albedo of the object, computed from the lights' intensities. If it exceeds 1, the intensities are wrong."""
         return math.pi * self.reflectance
 
 
 def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
-    """List the options of `--refine` that a fit refines. For `auto`, what the capture says about itself decides.
+    """List the options of `--refine` that a fit refines. The capture decides what `auto` stands for.
 
-    `light`: the `Lighting.kind`. `albedo`: that of the object, as it follows from the lights' intensities.
+    `light`: the `Lighting.kind`. `albedo`: albedo of the object, computed from the lights' intensities.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known

@@ -1,4 +1,4 @@
-"""Strength of the regulariser: it weakens during a fit, but not while something is wrong with the surface."""
+"""The strength of the regulariser. It falls during a fit, but not while the surface folds or explains too little."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ UNEXPLAINED = 0.2  #: share of unexplained light at which the regulariser has fu
 
 
 class RegulariserStrength:
-    """Schedules the regulariser's weight by the unexplained light and the self-intersections of recent iterations."""
+    """Controls the regulariser's strength by unexplained light and self-intersections in recent iterations."""
 
     def __init__(self) -> None:
         self.crossing: float = 0.0  #: share of self-intersecting triangles at the last count
@@ -27,9 +27,9 @@ class RegulariserStrength:
     def note(self, it: Iteration) -> None:
         """Update the strength after the iteration `it`.
 
-        Where photographs disagree with the model, a weak regulariser lets the surface fold. So the strength grows while
-        the surface intersects itself. After early intersections, which growing limbs cause, it catches up with its
-        schedule. After late ones it does not.
+        If the photographs disagree with the model, a weak regulariser lets the surface fold. So the strength rises
+        while the surface intersects itself. Later it falls again. After early self-intersections, which growing limbs
+        cause, it falls faster than usual until it is back on schedule. After late ones it stays behind its schedule.
         """
         step = 1 / it.context.schedule.shaping
         if it.number % CROSSING_EVERY == 0:
@@ -45,17 +45,17 @@ class RegulariserStrength:
             self.unexplained += RECENT * (unexplained - self.unexplained)
 
     def strength(self, decay: float) -> float:
-        """Factor for the regulariser's weight: it falls from 1 at the start to `decay` at the end of the fit.
+        """Return the factor of the regulariser's weight: it falls from 1 to `decay` during a fit.
 
-        It stays 1 while the model leaves much light unexplained: with wrong lights, or in a room that is not dark, a
-        weak regulariser would let the surface fold. It exceeds 1 while the surface intersects itself.
+        The factor stays 1 while the model leaves much light unexplained, for example with wrong lights: a weak
+        regulariser would let the surface fold. The factor may exceed 1 while the surface intersects itself.
         """
         return max(decay**self.weakened, min(1.0, (self.unexplained / UNEXPLAINED) ** 4))
 
     def state(self) -> dict[str, Any]:
-        """Collect what a checkpoint needs."""
+        """Return all values of this object, for a checkpoint."""
         return dict(vars(self))
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state()`."""
+        """Continue from `state`, a result of `state()`."""
         vars(self).update(state)

@@ -1,4 +1,7 @@
-"""Attributes that were renamed. The old names raise and tell the new ones; the next version drops this module."""
+"""Attributes that were renamed. An old name raises an error that contains the new name.
+
+The next version will not have this module.
+"""
 
 from typing import Any, ClassVar
 
@@ -25,7 +28,7 @@ ITERATION = {
 
 
 class Renamed:
-    """A class whose old attributes raise AttributeError with the new names."""
+    """Base class of classes with renamed attributes. An old name raises AttributeError, which contains the new name."""
 
     RENAMED: ClassVar[dict[str, str]]
 

@@ -1,4 +1,4 @@
-"""The renderer of a fit: from a model and a batch to predicted photographs."""
+"""The renderer of a fit: it predicts the photographs of a batch from the model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,10 +23,7 @@ from mi_ring.system.machine import autocast
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model predicts for a batch: V vertices and n photographs of H × W pixels.
-
-    Has gradients until `detached`.
-    """
+    """The prediction for a batch: V vertices and n photographs of H × W pixels. Its tensors have gradients."""
 
     vertices: Tensor  #: (V, 3) [scene units]
     material: dict[str, Tensor]  #: parameters of the BSDF by name, (V, 3) or (V,)
@@ -38,7 +35,7 @@ class Prediction:
     without_room: Tensor  #: (n, H, W, 3) linear radiance with the room's light as if nothing occluded it; detached
 
     def detached(self) -> "Prediction":
-        """Return a copy without the autograd graph, which uses memory."""
+        """Return a copy without gradients. It does not hold the autograd graph, which uses much memory."""
         return replace(self, vertices=self.vertices.detach(), rgb=self.rgb.detach(), coverage=self.coverage.detach(),
                        material={name: value.detach() for name, value in self.material.items()})  # fmt: skip
 
@@ -52,16 +49,19 @@ class Renderer:
         self.averages: Averages = {}  #: of interreflection
 
     def show(self, model: Model, level: int) -> Surface:
-        """Evaluate the model at this mesh level. Returns the surface and its lamps for rendering without gradients."""
+        """Evaluate the model at mesh level `level`, without gradients. Returns the surface, ready to be rendered.
+
+        If the fit refines lamps, the scene gets their current values.
+        """
         self.surface.show(model.ring, *model.ring.domain.sample(level))
         if model.calibration:
             model.calibration.relight(self.surface)
         return self.surface
 
     def picture(self, model: Model, capture: Capture, k: int, width: int, level: int, spp: int) -> np.ndarray:
-        """Render photograph `k` of the capture from the model, at most `width` [px] wide: linear radiance (H, W, 3).
+        """Render photograph `k` of the capture from the model. Returns linear radiance (H, W, 3), without gradients.
 
-        `level`: level of the mesh. `spp`: samples per pixel.
+        `width`: largest width of the picture [px]. `level`: level of the mesh. `spp`: samples per pixel.
         """
         photograph, surface = capture.photograph(k, -(-capture.shots[k].size[0] // width)), self.show(model, level)
         rgb, _ = prediction.draw(surface, photograph, spp, shadows=capture.shadows, indirect=model.ring.indirect)
@@ -111,10 +111,10 @@ class Renderer:
     def other_light(
         self, model: Model, batch: Batch, photographs: Photographs, coverage: Tensor
     ) -> tuple[GlobalIllumination | None, Averages]:
-        """Render interreflection and room light.
+        """Render interreflection and room light. Returns (this light, new averages of interreflection).
 
-        Returns (this light, updated averages), or (None, {}) if there is neither. With a table, interreflection is
-        averaged over iterations; see `averaged`. Otherwise the averages are empty.
+        Returns (None, {}) if there is neither. If the scene has a table, interreflection is averaged over iterations;
+        see `averaged`. Otherwise the averages are empty.
         """
         calibration, indirect, harmonics = model.calibration, model.ring.indirect, photographs.harmonics
         if calibration and calibration.solves_room(batch.progress):
@@ -126,13 +126,13 @@ class Renderer:
         return averaged(self.averages, other, batch) if indirect and self.surface.table is not None else (other, {})
 
     def remember(self, prediction: Prediction) -> None:
-        """Keep the averages of interreflection that `predict` has computed with this prediction."""
+        """Store the averages of interreflection in `prediction`, for the next `predict`."""
         self.averages |= prediction.averages
 
     def state(self) -> Averages:
-        """Collect what a checkpoint needs."""
+        """Return the averages of interreflection, for a checkpoint."""
         return self.averages
 
     def restore(self, state: Averages) -> None:
-        """Continue from `state()`."""
+        """Continue with the averages in `state`, a result of `state()`."""
         self.averages = state

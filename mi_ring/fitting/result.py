@@ -1,4 +1,4 @@
-"""From the parts of a fit to its `FitResult`."""
+"""Collects the results of a fit."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,9 +24,9 @@ def result_of(
     problem: Problem, model: Model, renderer: Renderer, schedule: Schedule, course: Course, capture: Capture,
     terms: Sequence[str], unexplained: float,
 ) -> FitResult:  # fmt: skip
-    """Collect the results of a fit.
+    """Collect the results of a fit for the functions that write them. Writes no files.
 
-    `capture`: with its final masks. `terms`: names of the terms of the loss. `unexplained`: see
+    `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: running mean of
     `Iteration.unexplained`.
     """
     calibration, ring, refined = model.calibration, model.ring, model.calibrated(capture)
@@ -61,7 +61,10 @@ def result_of(
 
 
 def room_of(problem: Problem, refined: Capture) -> np.ndarray | None:
-    """Return the room light (BASIS, 3) of the `refined` capture, minus the environment that the scene file contains."""
+    """Return the room light (BASIS, 3) that the fit has found: that of `refined` minus the scene's own environment.
+
+    `refined`: the calibrated capture. Returns None if there is no such light.
+    """
     room = refined.room
     if room is None or problem.environment is None:
         return room

@@ -1,4 +1,4 @@
-"""The sampler: what an iteration draws at random, as one `Batch`."""
+"""The sampler: it draws the points, photographs and random seeds of an iteration, as one `Batch`."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,9 +19,9 @@ PURPOSES = "photographs", "rotations", *SEEDED  #: of random generators
 
 @dataclass(frozen=True)
 class Batch:
-    """What one iteration has drawn: V domain points, photographs and random seeds.
+    """The random choices of one iteration: V points of the domain, photographs and random seeds.
 
-    n of its photographs are rendered by this process, N by all processes together.
+    All processes of a fit together render N photographs. This process renders n of them.
     """
 
     number: int  #: of the iteration, from 1
@@ -38,9 +38,9 @@ class Batch:
 
 
 class Sampler:
-    """Draws batches. Photographs come in random order, without repetition until all of the same size have been drawn.
+    """Draws batches. Photographs come in random order, and none comes twice before all of its size have come once.
 
-    Each purpose has a random generator of its own. So switching one off does not change what the others draw.
+    Each of the `PURPOSES` has its own random generator. So the draws for one purpose do not change the others.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -79,16 +79,19 @@ class Sampler:
         return np.array(waiting[:count]), size
 
     def observe(self, problem: Problem, capture: Capture, batch: Batch) -> Observation:
-        """Read the photographs of a batch. Raises InputError in all processes if one cannot read its files."""
+        """Read this process's photographs of a batch from `capture`.
+
+        Raises InputError in all processes if one process cannot read its files.
+        """
         seen = problem.processes.agreed(lambda: capture.observe(batch.photographs, batch.scale))
         return seen.to(problem.device)
 
     def state(self) -> dict[str, Any]:
-        """Collect what a checkpoint needs."""
+        """Return the states of the random generators and the photographs still to come, for a checkpoint."""
         return {"random": {name: random.get_state() for name, random in self.random.items()}, "waiting": self.waiting}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state()`. Raises ValueError if it contains photographs that this fit does not use."""
+        """Continue from `state`, a result of `state()`. Raises ValueError if it has photographs that are not fitted."""
         if not {k for some in state["waiting"].values() for k in some} <= {k for a in self.alike.values() for k in a}:
             raise ValueError("photographs that are not fitted")
         for name, random in self.random.items():

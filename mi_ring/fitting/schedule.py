@@ -1,4 +1,4 @@
-"""The schedule of a fit: coarse-to-fine stages, learning rates and blur, known before it begins."""
+"""The schedule of a fit: stages from coarse to fine, learning rates and blur. It is known before the fit begins."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixe
 
 
 class Stage(NamedTuple):
-    """A stage of a fit: level of the mesh, width of the photographs, iterations. Stages go from coarse to fine."""
+    """A stage of a fit. Mesh level and photograph width are constant in a stage; stages go from coarse to fine."""
 
     level: int  #: of the icosphere
     width: int  #: largest width of the photographs [px]
@@ -28,7 +28,7 @@ class Stage(NamedTuple):
 
 
 class Rate(NamedTuple):
-    """The learning rate of a parameter group."""
+    """The learning rate of a group of parameters, as a function of progress; see `learning_rate`."""
 
     initial: float
     decay: float  #: the factor that the rate has reached at the end; it falls exponentially
@@ -45,16 +45,16 @@ class Stepper(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """The stages of a fit, and all quantities that change with its progress."""
+    """The stages of a fit, and functions for the quantities that change with its progress."""
 
     stages: tuple[Stage, ...]
 
     @classmethod
     def of(cls, config: Config, near: bool = False, settling: bool = False) -> "Schedule":
-        """Plan the stages of a fit with these settings. Stages without iterations are left out.
+        """Plan the stages of a fit with these settings. A stage without iterations is left out.
 
-        `near`: does the fit start near the object's surface? `settling`: add a last stage in which the surface is
-        fixed.
+        `near`: the fit starts near the object's surface; its first stage is shorter. `settling`: add a last stage in
+        which the surface is fixed.
         """
         shares = list(config.shares)
         if near and len(shares) > 1:
@@ -87,22 +87,28 @@ class Schedule:
         return self.stages[-1].level
 
     def masks_due(self, iteration: int) -> bool:
-        """Should masks be refined before this iteration, counted from 0?"""
+        """Test whether masks are refined before `iteration`, counted from 0, if the fit refines masks."""
         return iteration in [int(progress * self.shaping) for progress in MASKS_REFINED]
 
     def stage(self, iteration: int) -> Stage:
-        """The stage of an iteration, counted from 0."""
+        """Return the stage of `iteration`, counted from 0."""
         return next(stage for stage in self.stages if iteration < stage.last)
 
     def progress(self, iteration: int) -> float:
-        """Share, in [0, 1], of the shaping iterations that are done before this one."""
+        """Return the progress of the fit before `iteration`, counted from 0.
+
+        It is the share of the iterations that shape the surface that are done. In the settling stage it is 1.
+        """
         return min(1.0, iteration / self.shaping)
 
     def outline_blur(self, progress: float, width: float) -> float:
-        """Standard deviation [px] of the silhouettes' blur in photographs of this width; at least one pixel."""
+        """Return the standard deviation [px] of the blur of silhouettes in photographs `width` [px] wide.
+
+        It shrinks with `progress`, 0 to 1, and is at least one pixel.
+        """
         return max(1.0, INITIAL_BLUR * (1 - progress / SHARP) * width)
 
 
 def learning_rate(rate: Rate, progress: float) -> float:
-    """The learning rate at this progress of a fit."""
+    """Return the learning rate at this `progress` of a fit, 0 to 1."""
     return rate.initial * rate.decay**progress * min(1.0, max(0.0, (progress - rate.start) / RAMP))

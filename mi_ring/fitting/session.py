@@ -1,4 +1,7 @@
-"""A fit from its first iteration to its results: progress, log, checkpoints, signals, full disks."""
+"""Runs a fit from its first iteration to its results, with progress bar, log and checkpoints.
+
+It writes results also after signals and errors, and if the disk is full.
+"""
 
 import contextlib
 import math
@@ -33,10 +36,10 @@ WORTH_MEASURING = 60  #: iterations: shorter fits do not measure how long an ite
 
 @contextlib.contextmanager
 def ending_signals() -> Iterator[Callable[[], int]]:
-    """Context manager that catches the signals which end a fit. A second Ctrl-C ends the program at once.
+    """Context manager that catches the signals that end a fit, so that the fit can end in order.
 
-    Yields a function that returns the first signal received, or 0. Other signals may arrive repeatedly, from shells,
-    schedulers and the kernel.
+    Yields a function that returns the number of the first signal received, or 0. After the first signal, Ctrl-C ends
+    the program at once. Repetitions of other signals have no effect: shells and schedulers may send them repeatedly.
     """
     received: list[int] = []
 
@@ -56,7 +59,7 @@ def ending_signals() -> Iterator[Callable[[], int]]:
 class Keeper:
     """Writes log, checkpoints and results of a fit into its folder. If writing fails, it tries again later.
 
-    Of several processes only the first one writes.
+    If the fit has several processes, only the first one writes. `prepare`: makes the folder again if it was removed.
     """
 
     def __init__(self, fit: Fit, folder: Path, prepare: Callable[[], None]) -> None:
@@ -66,7 +69,10 @@ class Keeper:
         self.saved, self.failing = -math.inf, False
 
     def follow(self, it: Iteration) -> None:
-        """Write log and checkpoint if they are due after this iteration: regularly, and at the end of each stage."""
+        """Write log and checkpoint if they are due after the iteration `it`.
+
+        A checkpoint is due every 30 seconds and at the end of each stage.
+        """
         log = self.fit.course.log
         if not self.writes:
             return
@@ -87,7 +93,7 @@ class Keeper:
         write_checkpoint(self.fit, self.files, self.folder)
 
     def attempt(self, write: Callable[[], None]) -> None:
-        """Call `write`. If it fails, tell the user once and go on."""
+        """Call `write`. If it fails, tell the user once, and do not raise the error."""
         try:
             write()
         except (InputError, OSError) as error:
@@ -98,9 +104,9 @@ class Keeper:
             self.failing = False
 
     def finish(self, fitted_scene: bytes) -> None:
-        """Write the results. If that fails, write them to a new temporary folder and raise InputError.
+        """Write the results. `fitted_scene`: content of the scene file with the fitted object.
 
-        `fitted_scene`: content of the scene file with the fitted object.
+        If the results cannot be written, writes them to a new temporary folder and raises InputError, which names it.
         """
         if not self.writes:
             return
@@ -112,9 +118,9 @@ class Keeper:
             raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(result, fitted_scene)}") from error
 
     def rescue(self, result: FitResult, fitted_scene: bytes) -> str:
-        """Write as much as possible of checkpoint and results to a temporary folder.
+        """Write as much as possible of checkpoint and results to a new temporary folder.
 
-        Returns a sentence that says where.
+        Returns a text for the user that names this folder.
         """
         saved = ""
         try:
@@ -133,9 +139,10 @@ class Keeper:
 
 
 def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
-    """Run the iterations until the end or an interruption, with progress bar, log and checkpoints.
+    """Run the iterations of a fit until its end or an interruption, with progress bar, log and checkpoints.
 
-    `interrupted` returns the signal received, or 0. `costs`: seconds per iteration; None: measure them.
+    `interrupted`: returns the number of the signal that interrupts the fit, or 0. `costs`: seconds per iteration, for
+    the progress bar; None: measure them.
     """
     if costs is None and fit.iterations - fit.iteration >= WORTH_MEASURING and not interrupted():
         left = [stage for stage in fit.schedule.stages if stage.last > fit.iteration]
@@ -170,7 +177,7 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
 
 @contextlib.contextmanager
 def resume_hint(folder: Path) -> Iterator[None]:
-    """Context manager that prints how to resume if a second Ctrl-C ends the program without results."""
+    """Context manager for the case that a second Ctrl-C ends the program: it prints how to resume the fit."""
     try:
         yield
     except KeyboardInterrupt:
@@ -180,7 +187,7 @@ def resume_hint(folder: Path) -> Iterator[None]:
 
 
 def start_of(fit: Fit) -> str:
-    """Describe in words the surface from which a fit starts."""
+    """Describe the start surface of a fit in words, for the user."""
     domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
     if isinstance(domain, Sphere):
         missing = fit.problem.config.domain == "auto" and fit.capture.whole and not installed("gpytoolbox")
@@ -190,10 +197,10 @@ def start_of(fit: Fit) -> str:
 
 
 def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Costs | None = None) -> int:
-    """Run a fit and write its results into `folder`, even if it is interrupted or fails.
+    """Run a fit and write its results into `folder`, even if the fit is interrupted or fails.
 
-    Returns the signal that interrupted it, or 0. `prepare` makes the folder again if someone removes it. `costs`:
-    seconds per iteration, if known.
+    Returns the number of the signal that interrupted the fit, or 0. `prepare`: makes the folder again if it was
+    removed. `costs`: seconds per iteration; None: measure them.
     """
     processes, model, config = fit.problem.processes, fit.model, fit.problem.config
     fitted_scene = processes.on_first(lambda: results.fitted_scene(fit.problem.given, fit.ring, folder))

@@ -1,4 +1,4 @@
-"""The start of a fit: its networks, the surface that is deformed, and the sphere that normalises it."""
+"""The start of a fit: its networks, its start surface and the normalising sphere; and checks of the input."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -39,7 +39,7 @@ def require_settings(capture: Capture, config: Config) -> None:
 
 
 def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -> FittedObject:
-    """Make the object as it is before the first iteration. `networks`: (Shape-Net, BRDF-Net); None: the default ones.
+    """Make the object as it is before the first iteration. `networks`: (Shape-Net, BRDF-Net); None: the paper's.
 
     Raises InputError if capture, settings and networks do not go together.
     """
@@ -79,9 +79,9 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
 
 
 def with_fresnel(bsdf: str) -> str:
-    """Switch on the Fresnel term in `bsdf`, the XML of a `cooktorrance`, unless the XML sets it to true or false.
+    """Switch on the Fresnel term of a `cooktorrance` unless its XML, `bsdf`, says whether it is on. Returns XML.
 
-    The term makes no difference for a flash at the camera, but it does for light from other sides.
+    The term makes no difference for a flash at the camera. It makes one for light from other sides.
     """
     element = ElementTree.fromstring(bsdf)
     if element.find("boolean[@name='fresnel']") is None:
@@ -90,9 +90,10 @@ def with_fresnel(bsdf: str) -> str:
 
 
 def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:
-    """Choose the start surface. Returns (domain, centre (3,) and radius of the normalising sphere [scene units]).
+    """Choose the start surface of a fit. `choice`: the setting `domain`, which may be "auto".
 
-    `choice`: the setting `domain`, which may leave the choice to the scene.
+    Returns (domain, centre (3,) of the normalising sphere, its radius) [scene units]. Raises InputError if the surface
+    that `choice` names cannot be made.
     """
     shape = capture.shape
     if isinstance(choice, tuple):
@@ -138,7 +139,7 @@ def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarr
 
 
 def require_networks(ring: FittedObject) -> None:
-    """Raise InputError if the outputs of Shape-Net or BRDF-Net have wrong shapes."""
+    """Raise InputError if Shape-Net or BRDF-Net of an object returns tensors of wrong shape."""
     s = torch.zeros(2, 3, device=next(ring.parameters()).device)
     with torch.no_grad():
         moved = ring.shape_net(s)

@@ -1,4 +1,4 @@
-"""What a fit has refined besides surface and material, as plain numbers: `calibration.json`."""
+"""Collects the content of `calibration.json`: the calibration that a fit has found, as plain numbers."""
 
 from typing import Any
 
@@ -13,11 +13,13 @@ from mi_ring.fitting.problem import Problem
 
 @torch.no_grad()
 def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Collect the content of calibration.json: `refined` (options), `light` (its kind), `unknowns`, `photographs`.
+    """Collect the content of calibration.json. Writes no file.
 
-    `unknowns`: for each its meaning (`what`), `before`, `after` and, except for the room's light, the standard
-    deviation `std` for a fixed surface. `photographs`: for each fitted one how far the object has moved in it [px], and
-    the unknowns of this photograph. Arguments: `refined`, the calibrated capture; `deviations`, from `covariance`.
+    `refined`: the calibrated capture. `deviations`: result of `covariance`. Returns a dictionary with these keys.
+    `refined`: list of the refined options. `light`: kind of the light. `unknowns`: by name, for each unknown that
+    photographs share, its meaning (`what`), its value `before` and `after` the fit, and its standard deviation `std`
+    for a fixed surface (not for the room's light). `photographs`: by name, for each fitted photograph, how far the
+    object has moved in it (`moved_px`) and its own unknowns.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None

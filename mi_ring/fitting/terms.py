@@ -1,4 +1,4 @@
-"""The terms of the loss, as functions of an `Iteration`, and their weighted sum."""
+"""The terms of the loss, each a function of an `Iteration`, and their weighted sum."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iter
 
 
 class Term(NamedTuple):
-    """A term of the loss: a function, its weight, and a factor of the weight that may change during the fit."""
+    """A term of the loss: a function, its weight, and a factor of the weight that changes during the fit."""
 
     function: Callable[[Iteration], Tensor | None]  #: its value, a scalar; None: it does not apply this time
     weight: float = 1.0  #: used if `Config.weights` has none of its name; 0 switches the term off
@@ -30,16 +30,16 @@ TermLike: TypeAlias = Term | Callable[[Iteration], Tensor | None]
 
 
 def rgb(it: Iteration) -> Tensor:
-    """The term `rgb`: difference between predicted and observed colours."""
+    """Compute the term `rgb`: the difference between predicted and observed colours."""
     seen, context = it.observation, it.context
     return rgb_loss(it.prediction.rgb, seen.rgb, seen.clipped, context.exposure, context.config.loss, it.counted())
 
 
 def mask(it: Iteration) -> Tensor | None:
-    """The term `mask`: difference between predicted silhouettes and masks. None if no photograph has a mask.
+    """Compute the term `mask`: the difference between predicted silhouettes and masks.
 
-    In a lit room, masks are estimates. Once the shape has settled, the majority of masks outweighs single wrong ones,
-    for instance one that contains a shadow.
+    Returns None if no photograph of the batch has a mask. In a lit room masks may be wrong, for example contain a
+    shadow. So large differences count less there in the second half of the fit.
     """
     seen, context = it.observation, it.context
     masked = float(it.batch.share.sum(seen.masked.sum()))
@@ -58,7 +58,10 @@ def mask(it: Iteration) -> Tensor | None:
 
 
 def velocity(it: Iteration) -> Tensor | None:
-    """The term `velocity`, L_reg, at random points on the paths of domain points. None while the surface is fixed."""
+    """Compute the term `velocity`, L_reg, at random points on the paths of domain points.
+
+    Returns None while the surface is fixed.
+    """
     if it.stage.settles:
         return None
     net = it.context.model.ring.shape_net
@@ -73,15 +76,15 @@ def velocity(it: Iteration) -> Tensor | None:
 
 
 def calibration(it: Iteration) -> Tensor | None:
-    """The term `calibration`: the prior of the unknowns of calibration."""
+    """Compute the term `calibration`: the prior of the unknowns of calibration. None if there are no unknowns."""
     calibration = it.context.model.calibration
     return calibration.prior() if calibration else None
 
 
 def settling(it: Iteration) -> Tensor | None:
-    """The term `settling`: variation of the material while the surface is fixed.
+    """Compute the term `settling`: the variation of the material along the surface.
 
-    Slow variation is probably due to light.
+    It reduces slow variation, which is probably an effect of the light. Returns None until the surface is fixed.
     """
     return priors.albedo_variation(it) if it.stage.settles else None
 
@@ -102,12 +105,13 @@ RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage",
 
 
 class Loss:
-    """The weighted sum of terms."""
+    """The loss: the weighted sum of its terms. Call it with an `Iteration`."""
 
     def __init__(self, terms: Mapping[str, TermLike] | None, weights: Mapping[str, float]) -> None:
-        """Make a loss of `terms`, by default `default_terms`, with `weights` by their names.
+        """Make a loss. `terms`: by name; None: `default_terms`. `weights`: by name of the term.
 
-        Raises InputError for a reserved name, for a weight without a term, and if no term compares with photographs.
+        Raises InputError for a reserved name, for a weight whose term does not exist, and if no term with a weight
+        above 0 compares the surface with photographs.
         """
         given = default_terms if terms is None else terms
         self.terms = {name: term if isinstance(term, Term) else Term(term) for name, term in given.items()}
@@ -131,9 +135,10 @@ class Loss:
                              "needs; give it one, or the term the weight 0")  # fmt: skip
 
     def __call__(self, it: Iteration) -> Tensor:
-        """Compute this process's part of the loss, a scalar. The iteration gets loss, terms and weights of all.
+        """Compute this process's part of the loss. Returns a scalar; the parts of all processes add up to the loss.
 
-        A term is a mean over photographs, or is equal in all processes: parts add up by their weights.
+        Writes the loss of all processes, its terms and their weights into `it`. Raises InputError if a term returns
+        anything but a scalar tensor or None.
         """
         loss, values = torch.zeros((), device=it.batch.points.device), dict.fromkeys(self.terms, (0.0, 0.0))
         for name, term in self.terms.items():

@@ -1,6 +1,6 @@
-"""Validation on held-out photographs: does what was refined explain them better?
+"""Validation on held-out photographs: does the refined calibration predict them better than the given calibration?
 
-Surface and material are not fitted again when values are reset. So the comparison favours what was refined.
+Surface and material are not fitted again with the given calibration. So the comparison favours the refined one.
 """
 
 import copy
@@ -23,10 +23,10 @@ PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per
 
 
 def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) -> float:
-    """Mean absolute error on the object in held-out photographs, divided by the observed radiance.
+    """Render held-out photographs. Returns the mean absolute error on the object, divided by the observed radiance.
 
-    Each prediction is first scaled to fit its photograph best. `level`: level of the mesh. NaN if no held-out
-    photograph shows the object.
+    Each prediction is first multiplied by the factor that fits its photograph best. `level`: level of the mesh. Returns
+    NaN if no held-out photograph shows the object.
     """
     capture, shares = model.calibrated(problem.capture), []
     surface = renderer.show(model, level)
@@ -48,8 +48,10 @@ def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) 
 def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Any]:
     """Reset each option of `--refine` that does not improve the prediction of held-out photographs.
 
-    Returns `unexplained` of the final model; `before`: the same with the capture's values for all unknowns; `put_back`:
-    the options that were reset. If held-out photographs do not show the object, only `put_back` is returned.
+    To reset an option is to give its unknowns the values of the capture. Options of single photographs are not reset.
+    Returns a dictionary. `put_back`: list of the reset options. `unexplained`: the error of the final model, see
+    `unexplained`. `before`: the same error with the capture's values for all unknowns. The last two are missing if no
+    held-out photograph shows the object; `before` is also missing if nothing is refined.
     """
     calibration = model.calibration
 

@@ -37,12 +37,12 @@ class DiligentMV(Source):
     )  # fmt: skip
 
     views: tuple[int, ...] = ()
-    """Numbers of the views to take, 1 to 20, for example 1 6 11 16. Without it: all."""
+    """Numbers of the views to take, 1 to 20, for example 1 6 11 16. Without this option: all."""
     lights: tuple[int, ...] = ()
-    """Numbers of the lights to take for each view, 1 to 96, for example 1 33 65. Without it: all."""
+    """Numbers of the lights to take for each view, 1 to 96, for example 1 33 65. Without this option: all."""
     fill_holes: bool = False
     """Fill holes in the masks.
-    Use it for the object bear, whose masks have wrong holes. The holes in the masks of pot2 and cow are real."""
+    Use this option for the object bear: the holes in its masks are wrong. The holes of pot2 and cow are real."""
 
     def frames(self) -> Iterator[Frame]:
         file = self.src / "Calib_Results.mat"

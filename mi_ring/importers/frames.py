@@ -65,11 +65,11 @@ class Source:
     """Scene file to write, for example pot.xml. Other new files, such as undistorted photographs, go to pot/."""
     copy: bool = False
     """Copy the photographs beside the scene file, to keep everything in one place.
-    Without it the scene file refers to the originals, which must stay where they are."""
+    Without this option the scene file refers to the originals, which must stay where they are."""
     encoding: Encoding = "auto"
-    """How pixel values encode radiance. Set it if auto is wrong. srgb: by the sRGB curve. linear: in proportion.
-    auto: as the format of SRC says; if it does not say, srgb for 8-bit files and linear for others.
-    Linear 8-bit files are written again with 16 bits."""
+    """How the files encode radiance. Set this option if auto is wrong. srgb: by the sRGB curve. linear: in proportion.
+    auto: as the format of SRC says. If the format does not say: srgb for 8-bit files, linear for others.
+    The command writes copies with 16 bits of linear 8-bit files."""
     photographs: Suppress[Sequence[Path] | None] = None
     """The photographs to import; other cameras are ignored. None: all, and each camera must have a photograph."""
 

@@ -20,11 +20,12 @@ class NamedPhotographs(Source):
     names: ClassVar[tuple[str, ...]] = ()  #: of the file of cameras, where SRC is a folder
 
     images: Path | None = None
-    """Folder of the photographs. Without it: where the file says, or the nearest folder `images` beside or above SRC.
-    A photograph is found by its file name. If several files have this name, the names of their folders decide."""
+    """Folder of the photographs. The command searches it for the file names in SRC. If several files have one name,
+    the names of their folders decide.
+    Without this option: the places that SRC names, or the nearest folder `images` beside or above SRC."""
     masks: Path | None = None
     """Folder of masks: photo.jpg has the mask photo.jpg.png, photo.png or photo.jpg.
-    Without it: the masks that the file names, alpha channels, or a folder `masks` beside the photographs."""
+    Without this option: the masks that SRC names, alpha channels, or a folder `masks` beside the photographs."""
 
     def posed(self) -> Iterator[Frame]:
         """Yield the photographs that have a pose.

@@ -1,4 +1,4 @@
-"""Numbers for the quality of captures, fits and the renderer.
+"""Measures the quality of captures, fits and the renderer.
 
 May import: mitsuba, drjit, numpy, scipy, skimage, trimesh, gpytoolbox, torch, igl; images, capture, plugins,
 rendering, objects, scene, geometry, system.

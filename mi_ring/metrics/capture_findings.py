@@ -1,4 +1,4 @@
-"""Quality of the photographs of a capture, and findings: problems that the user should correct."""
+"""Measures the quality of a capture's photographs, and lists findings: problems that the user should correct."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -20,9 +20,9 @@ FAR, LEAST_FAR = 4.0, 2.0  #: a camera has moved far: more than this multiple of
 
 
 def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
-    """Name the photographs that a fit has moved much farther than the others; empty if there are none.
+    """Name the photographs whose camera a fit has moved much farther than the others. Returns a text for the user.
 
-    `photographs`: that entry of calibration.json.
+    The text is empty if there are no such photographs. `photographs`: the entry of this name in calibration.json.
     """
     moved = {name: entry["moved_px"] for name, entry in photographs.items()}
     limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()) or [0])))
@@ -30,9 +30,9 @@ def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
 
 
 def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
-    """Name the photographs whose light is much stronger or weaker than in the others.
+    """Name the photographs whose light, by a fit, is much stronger or weaker than the others' lights.
 
-    Argument and result: as `moved_far`.
+    Argument and result: as for `moved_far`.
     """
     powers = {name: float(np.exp(np.log(e["power"]).mean())) for name, e in photographs.items() if "power" in e}
     odd = {name: power for name, power in powers.items() if not 1 / ODD_POWER < power < ODD_POWER}
@@ -40,9 +40,9 @@ def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
 
 
 def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
-    """Read calibration.json beside a scene file. Returns (`moved_far`, `odd_powers`) for the photographs `names`.
+    """Read calibration.json beside a scene file. Returns the texts (`moved_far`, `odd_powers`) about photographs.
 
-    Both are empty without this file.
+    `names`: the photographs of the capture. Both texts are empty if there is no such file.
     """
     record = read_json(scene.parent / "calibration.json")
     try:
@@ -54,7 +54,7 @@ def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
 
 @dataclass
 class PhotographQuality:
-    """Quality measures of one photograph: a row in the table of `mi-ring check`. Lengths are in radii of the object."""
+    """The quality of one photograph: a row in the table of `mi-ring check`. Lengths are in radii of the object."""
 
     name: str
     distance: float  #: from the camera to the object
@@ -83,7 +83,11 @@ agreement: share of the mask that the other masks agree with"""
 def measure(
     capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]
 ) -> list[PhotographQuality]:
-    """Measure the quality of each photograph. `agreement`: share of each mask that the other masks confirm, by file."""
+    """Measure the quality of each photograph. Reads all photographs.
+
+    `center` (3,), `radius`: normalising sphere [scene units]. `agreement`: share of each mask that the other masks
+    confirm, by file; from `mask_agreement.agreements`.
+    """
     lights, rows = capture.photographs.lights, []
     lit = np.any(lights.rgb() > 0, axis=1)
     of_each = zip(capture.shots, capture.names, lights.toward(center), lights.distances(center),
@@ -111,13 +115,16 @@ def measure(
 
 
 def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
-    """Irradiance (N,) at the object, `center` (3,), in each photograph; 1 everywhere if the lights are unknown."""
+    """Compute the irradiance (N,) at the object in each photograph; 1 in all if the lights are unknown.
+
+    `center` (3,): centre of the object.
+    """
     received = capture.photographs.irradiance(center).mean(1)
     return received if np.median(received) > 0 else np.ones_like(received)
 
 
 def units(capture: Capture, center: np.ndarray) -> str | None:
-    """Warn the user, in a sentence, if lights and cameras seem to have different length units; otherwise None."""
+    """Return a warning for the user if lights and cameras seem to have different length units; otherwise None."""
     lights, point = capture.photographs.lights.positions(), capture.photographs.lights.is_finite()
     cameras = np.stack([shot.camera.position for shot in capture.shots])
     if not point.any() or np.ptp(cameras, axis=0).max() == 0:
@@ -134,7 +141,7 @@ def units(capture: Capture, center: np.ndarray) -> str | None:
 
 
 def facing(capture: Capture, center: np.ndarray) -> str | None:
-    """Warn the user, in a sentence, if cameras face away from the object; otherwise None."""
+    """Return a warning for the user if cameras face away from the object, at `center` (3,); otherwise None."""
     cameras = [shot.camera for shot in capture.shots]
     away = np.array([(center - camera.position) @ camera.forward < 0 for camera in cameras])
     if away.mean() > 0.5:
@@ -144,10 +151,11 @@ def facing(capture: Capture, center: np.ndarray) -> str | None:
 
 
 def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
-    """Estimate a lower bound of the share of room light in all light on the object; 0 if none is found.
+    """Estimate how much of the light on the object is room light: a lower bound of the share, 0 to 1.
 
-    `brightness` (n,): of the object in each photograph. `received` (n,): irradiance by the known lights. Room light
-    does not depend on the distance of the flash, so the object looks too bright where this irradiance is small.
+    `brightness` (n,): brightness of the object in each photograph, divided by `received`. `received` (n,): irradiance
+    by the known lights. Room light does not depend on the distance of the flash. So if there is room light, the object
+    looks too bright where `received` is small.
     """
     if len(received) < 12 or received.max() < 1.5 * received.min():
         return 0.0
@@ -158,7 +166,10 @@ def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
 
 
 def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np.ndarray) -> list[str]:
-    """List the problems of a capture, one sentence each. `rows`: what `measure` returned."""
+    """List the problems of a capture, each as a sentence for the user. `rows`: result of `measure`.
+
+    `center` (3,): centre of the object.
+    """
     found: list[str] = []
     agree = [row.agreement for row in rows if row.agreement is not None]
     if capture.whole and agree and np.median(agree) >= CONFORMS:  # masks of bright parts only need not agree
@@ -199,7 +210,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
 
 
 def quality_table(rows: list[PhotographQuality]) -> str:
-    """Format the rows as text, with a legend. Brightness is relative to the median."""
+    """Format the rows as a text table with a legend. The table shows brightness relative to the median."""
     typical = float(np.median([row.brightness for row in rows]))
     lines = [["photograph", *FORMATS]]
     for row in rows:
@@ -214,7 +225,7 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 
 
 def without_empty_masks(capture: Capture) -> tuple[Capture, list[str]]:
-    """Remove empty masks from a capture. Returns the capture, and the names of the photographs that had them."""
+    """Remove empty masks from a capture. Returns (new capture, names of the photographs with an empty mask)."""
     given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
     empty = [k for k in given if not (shrink_mask(capture.masks[k], MAX_WIDTH)[0] > 127).any()]
     masks = capture.masks.replaced(dict.fromkeys(empty))

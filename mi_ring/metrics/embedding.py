@@ -1,4 +1,7 @@
-"""Tests whether a surface is an embedding, as a flow gives it: without inverted and without crossing triangles."""
+"""Tests whether a surface is an embedding: a surface without inverted triangles and without crossing triangles.
+
+An exactly solved flow makes an embedding.
+"""
 
 import numpy as np
 import torch
@@ -11,10 +14,11 @@ STEP = 1e-3  #: distance from a triangle of the points on its two sides, in the 
 
 
 def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.ndarray:
-    """Find triangles `faces` (F, 3) of domain points `s` (V, 3) that Shape-Net flattens or inverts: (F,) bool.
+    """Find the triangles that Shape-Net flattens or turns inside out. Returns (F,) bool.
 
-    Shape-Net moves a point from the outer side of such a triangle to the inner side. For infinitely small triangles
-    this means det ∂Φ/∂s ≤ 0, which is impossible for an exactly solved flow.
+    `s` (V, 3), `faces` (F, 3): a mesh of the domain. Shape-Net moves a point on the outer side of such a triangle to
+    the inner side. For infinitely small triangles this means det ∂Φ/∂s ≤ 0, which is impossible for an exactly solved
+    flow.
     """
     s = s.to(ring.center.device)
     corners = torch.as_tensor(faces, device=s.device)
@@ -30,9 +34,9 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
 
 
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Find triangles that cross, overlap or touch others, in exact arithmetic: (F,) bool.
+    """Find the triangles that cross, overlap or touch other triangles, in exact arithmetic. Returns (F,) bool.
 
-    Raises InputError without libigl.
+    Raises InputError if the package libigl is not installed.
     """
     need("igl", "the exact count of crossing triangles", "libigl")
     from igl.copyleft.cgal import remesh_self_intersections

@@ -1,4 +1,4 @@
-"""Evaluation of a fit against ground truth."""
+"""Compares a fit with the ground truth."""
 
 import json
 from pathlib import Path
@@ -33,13 +33,16 @@ def evaluate(
     run: str | Path, mesh: str | Path, novel: str | Path | None = None, spp: int = SPP, seen: bool = False,
     align: str | None = None,
 ) -> dict:  # fmt: skip
-    """Compare a fit, in the results folder `run`, with the truth. Returns errors by name.
+    """Compare a fit with the truth. Renders photographs. Returns a dictionary of numbers by name.
 
-    `mesh`: true surface. `novel`: scene file of novel views. `spp`: samples per pixel of predicted photographs. `seen`:
-    measure distances between surfaces only where a photograph shows them. `align`: "rigid" or "similarity" first aligns
-    the truth and `novel` with the fit; `aligned_*` is this motion. Numbers end in `_input` for fitted photographs and
-    in `_held_out` for held-out ones; `views` and `novel_views` list them by photograph. Undefined numbers are missing,
-    such as the genus of an open mesh.
+    `run`: results folder of the fit. `mesh`: file of the true surface. `novel`: scene file of photographs that the fit
+    has not used. `spp`: samples per pixel of predicted photographs. `seen`: measure distances between surfaces only
+    where a photograph shows them. `align`: "rigid" or "similarity": first align the truth and `novel` with the fit; the
+    numbers `aligned_…` describe this motion.
+
+    Numbers that end in `_input` are about fitted photographs, those in `_held_out` about held-out photographs, those in
+    `_novel` about `novel`. `views` and `novel_views` are lists with the numbers of each photograph. A number that is
+    not defined, such as the genus of an open mesh, is missing.
     """
     run, mesh = Path(run), Path(mesh)
     ring, capture = load_fit(run), load_capture(run / "scene.xml", width=COMPARED, crop=False)
@@ -82,7 +85,7 @@ def evaluate(
 
 
 def evaluation_table(numbers: dict[str, float]) -> str:
-    """Format `numbers` of `evaluate` as text, with a line for each of the `LINES`."""
+    """Format the `numbers` of `evaluate` as a text table."""
     lines = []
     for start, words in LINES.items():
         found = {key.removeprefix(start).strip("_"): value for key, value in numbers.items() if key.startswith(start)}
@@ -94,5 +97,5 @@ def evaluation_table(numbers: dict[str, float]) -> str:
 
 
 def rounded(value: Any) -> Any:
-    """Round all floats in a JSON value to four decimals; more are not significant."""
+    """Return a JSON value in which all floats are rounded to four decimals."""
     return json.loads(json.dumps(value), parse_float=lambda digits: round(float(digits), 4))

@@ -1,4 +1,4 @@
-"""Errors of predicted photographs: PSNR and SSIM."""
+"""Measures the errors of predicted photographs: PSNR and SSIM."""
 
 from collections.abc import Sequence
 
@@ -19,11 +19,12 @@ WINDOW = 11  #: width of the window of SSIM [px]
 def compare_photographs(
     capture: Capture, ring: FittedObject, spp: int, index: Sequence[int] | None = None
 ) -> tuple[dict[str, float], list[dict]]:
-    """Predict photographs `index` (default: all) and compare.
+    """Predict photographs and compare the predictions with the photographs.
 
-    Returns ({`psnr` [dB], `ssim`} of all, list by photograph). Predictions have `spp` samples per pixel and are 8-bit
-    sRGB, as `mi_ring.render` writes them. Only `comparable` pixels count. The total PSNR is that of the mean squared
-    error, the total SSIM is the mean. `psnr` is missing if the prediction is exact.
+    `index`: the photographs; default: all. `spp`: samples per pixel. Returns ({`psnr` [dB], `ssim`} of all photographs,
+    list of such dictionaries with the `name` of each photograph). Predictions are 8-bit sRGB, as mi-ring render writes
+    them. Only `comparable` pixels count. The total PSNR is that of the mean squared error, and the total SSIM is the
+    mean. `psnr` is missing if the prediction is exact.
     """
     surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
@@ -62,10 +63,11 @@ def decibels(square: float) -> dict[str, float]:
 
 
 def ssim(a: np.ndarray, b: np.ndarray, compared: np.ndarray | None = None) -> dict[str, float]:
-    """Structural similarity {`ssim`: value} of two images (H, W, 3) in [0, 1]; {} if they are smaller than the window.
+    """Compute the structural similarity of two images (H, W, 3) in [0, 1]. Returns {`ssim`: value}.
 
-    It is the mean over channels and over the pixels `compared` (H, W) bool. None: over the pixels whose window is
-    inside the image. Wang et al., Image Quality Assessment, IEEE TIP 2004: Gaussian window of 11 × 11 px, σ = 1.5 px.
+    Returns {} if the images are smaller than the window. The value is the mean over channels and over the pixels
+    `compared` (H, W) bool; None: over all pixels whose window is inside the image. The definition is that of Wang et
+    al., Image Quality Assessment, IEEE TIP 2004: Gaussian window of 11 × 11 px, σ = 1.5 px.
     """
     if min(a.shape[:2]) < WINDOW:
         return {}

@@ -1,4 +1,4 @@
-"""Tests whether the masks of a capture agree, and finds the mistake in the cameras if they do not."""
+"""Tests whether the masks of a capture agree. If they do not, it looks for a mistake in cameras or masks."""
 
 import copy
 from collections.abc import Sequence
@@ -14,9 +14,10 @@ CONFORMS = 0.9  #: least share of a mask that the others must agree with
 
 
 def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
-    """Test whether masks agree.
+    """Test whether the masks of a capture agree.
 
-    Returns (share of each mask that all others confirm, by file; problems as sentences).
+    Returns (by mask file, the share of the mask that all other masks confirm; list of problems, as sentences for the
+    user). Both are empty if the capture has no visual hull.
     """
     if not capture.hull:
         return {}, []
@@ -43,7 +44,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
 
 
 def with_camera(silhouette: Silhouette, **changed: Any) -> Silhouette:
-    """Return a copy of a silhouette in which the `changed` fields of the camera are replaced."""
+    """Return a copy of a silhouette whose camera has other values. `changed`: fields of the camera by name."""
     return silhouette._replace(camera=silhouette.camera._replace(**changed))
 
 
@@ -74,7 +75,10 @@ OTHERS = {
 
 
 def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
-    """Share of mask pixels that all masks confirm: their rays hit the visual hull. 0 if the hull is empty."""
+    """Compute the share of mask pixels that all masks confirm: the rays of these pixels hit the visual hull.
+
+    It is 0 if the hull is empty.
+    """
     try:
         return float((Hull(silhouettes, "").shortfall(samples=48) < 1).mean())
     except InputError:
@@ -82,13 +86,13 @@ def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
 
 
 def border(silhouette: Silhouette) -> float:
-    """Share of the pixels at the border of a photograph that are object according to the mask."""
+    """Compute the share of the pixels at the border of a photograph that belong to the object, by the mask."""
     mask = silhouette.mask > 127
     return float(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean())
 
 
 def mistake_in_masks(silhouettes: Sequence[Silhouette]) -> dict[str, Sequence[Silhouette]]:
-    """List possible mistakes in the masks: the silhouettes with the mistake removed, by its description."""
+    """Find possible mistakes in the masks. Returns, by description of the mistake, the corrected silhouettes."""
     guesses: dict[str, Sequence[Silhouette]] = {}
     if np.median([border(silhouette) for silhouette in silhouettes]) > 0.5:  # an object is rarely all around
         guesses["masks are inverted: 255 is to be the object, 0 the background"] = [
@@ -102,7 +106,10 @@ def mistake_in_masks(silhouettes: Sequence[Silhouette]) -> dict[str, Sequence[Si
 
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
-    """Find a common mistake in masks or cameras that explains why masks disagree. Returns its description, or None."""
+    """Find a mistake in all masks or cameras that explains why the masks disagree.
+
+    Returns its description for the user; None if no such mistake is found.
+    """
     some = subsample(silhouettes, 32, 96)
     limit = max(CONFORMS, share_agreed(some) + 0.05)
     masks = {name: share_agreed(subsample(guess, 32, 96)) for name, guess in mistake_in_masks(silhouettes).items()}
@@ -122,7 +129,7 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
 
 
 def half_pixel(hull: Hull) -> str | None:
-    """Test whether all principal points are wrong by half a pixel. Returns a sentence, or None if they are right."""
+    """Test whether all principal points are wrong by half a pixel. Returns a sentence for the user; None if not."""
     gaps, hull, some = dict[float, float](), copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
     silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):

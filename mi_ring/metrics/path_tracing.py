@@ -1,4 +1,4 @@
-"""Renders the same photographs with `photometric` and with Mitsuba's path tracer."""
+"""Renders the same photographs with `photometric` and with Mitsuba's path tracer, for a comparison."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,10 @@ LANES = 1 << 21  #: most rays in one launch
 
 @dataclass
 class Pictures:
-    """Renderings of one photograph by `photometric` and by `path`: 16 independent ones each, (16, H, W, 3), linear."""
+    """Pictures of one photograph by `photometric` and by `path`. Each field has 16 independent ones, (16, H, W, 3).
+
+    All are linear radiance.
+    """
 
     photometric: np.ndarray
     unshadowed: np.ndarray  #: photometric without shadows, same samples
@@ -32,9 +35,10 @@ class Pictures:
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """Load a scene, without tables, that Mitsuba's own integrators can light. Returns (scene, `photograph` sensors).
+    """Load a scene file for a comparison. Returns (scene, list of its `photograph` sensors).
 
-    Raises InputError if the scene is not suitable.
+    The scene has no tables, and Mitsuba's own integrators use the photographs' lights in it. Raises InputError if the
+    scene is not suitable, for example because a `shapenet` has no fitted object.
     """
     scene, shots = open_scene(path)
     try:
@@ -51,7 +55,7 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
 def with_flash(scene: mi.Scene) -> mi.Scene:
     """Return the scene with exactly one `flash` and no `room`, for Mitsuba's own integrators.
 
-    A `shapenet` has a `flash` already. Raises SceneError if there are several.
+    The `flash` of a `shapenet` counts. Raises SceneError if the scene has several.
     """
     count = sum(isinstance(emitter, flash.Flash) for emitter in scene.emitters())
     if count > 1:
@@ -69,8 +73,8 @@ def render_both(
 ) -> Pictures:
     """Render photograph `k`, whose sensor is `sensor`, by `photometric` and by Mitsuba's `path`, 16 times each.
 
-    Pictures are `scale` times smaller, with `spp` samples per pixel and paths of at most `depth`. Seeds are `seed` to
-    `seed` + 31, different for both renderers. Neither uses the film's filter.
+    `scale`: how many times smaller the pictures are. `spp`: samples per pixel. `depth`: largest length of the paths.
+    The seeds are between `seed` and `seed` + 31; both renderers have different ones. The film's filter is not used.
     """
     size = sensor.camera.size
     width, height = (s // scale for s in size)
@@ -96,7 +100,10 @@ def render_both(
 def render_path(
     scene: mi.Scene, photographs: Photographs, sensor: Any, spp: int, seed: int, depth: int
 ) -> list[mi.Float]:
-    """Render a photograph by Mitsuba's `path`: [R, G, B]. All selected photographs must be the one of `sensor`."""
+    """Render a photograph by Mitsuba's `path`. Returns [R, G, B], Floats with one value per pixel.
+
+    `photographs`: the photograph of `sensor`, selected once or several times.
+    """
     photograph.Photograph.current = sensor
     ray, _ = pixel_rays(photographs, spp, seed)
     ray.time = photograph.SHUTTER

@@ -17,9 +17,9 @@ IMPLAUSIBLE = 0.75  #: share of interreflection above which the intensities are 
 
 @dataclass
 class Comparison:
-    """Differences between `photometric` and `path` in one photograph or all.
+    """Differences between `photometric` and `path` in one photograph, or in all together.
 
-    Shares are of the mean radiance of `path`.
+    All numbers but `radiance`, `psnr` and the probabilities are shares of the mean radiance of `path`.
     """
 
     name: str
@@ -37,13 +37,14 @@ class Comparison:
 
 
 def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
-    """The p-value of the difference of independent pictures a, b (16, H, W, 3) float64, if both renderers agree.
+    """Test the hypothesis that both renderers agree, by independent pictures a and b (16, H, W, 3) float64.
 
-    It is the smaller of two p-values, with Šidák's correction. The first tests the mean of all pixels, by Student's t.
-    The second tests blocks of 8 × 8 pixels. Under equal distributions, each of the 16 differences d of a block has
-    either sign with equal probability, even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance 2 −
-    2 Σ d⁴ / (Σ d²)². Blocks are independent, so their sum has about a gamma distribution of known mean and variance.
-    Channels share samples, so each block uses only one channel: red, green, blue in turn.
+    Returns the p-value: the probability of so large a difference if they agree. It is the smaller one of two p-values,
+    with Šidák's correction. The first one tests the mean of all pixels, by Student's t. The second one tests blocks of
+    8 × 8 pixels. If the distributions are equal, each of the 16 differences d of a block is positive or negative with
+    equal probability, even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance
+    2 − 2 Σ d⁴ / (Σ d²)². Blocks are independent, so the sum over blocks has about a gamma distribution of known mean
+    and variance. Channels share samples, so each block uses one channel: red, green, blue in turn.
     """
     whole, count = a.mean((1, 2, 3)) - b.mean((1, 2, 3)), len(a)
     error = np.hypot(whole.std(ddof=1) / np.sqrt(count), ROUNDING * (a.mean() + b.mean()))
@@ -62,9 +63,9 @@ def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def blocks(x: np.ndarray) -> np.ndarray:
-    """Sum pictures (16, H, W, 3) over pixel blocks, using one channel per block: (16, h, w).
+    """Sum pictures (16, H, W, 3) over blocks of 8 × 8 pixels. Returns (16, h, w), with one channel per block.
 
-    Border blocks are smaller.
+    Blocks at the border are smaller.
     """
     _, height, width, _ = x.shape
     x = np.pad(x, ((0, 0), (0, -height % BLOCK), (0, -width % BLOCK), (0, 0)))
@@ -74,12 +75,15 @@ def blocks(x: np.ndarray) -> np.ndarray:
 
 
 def sidak(p: Sequence[float] | np.ndarray) -> float:
-    """The smallest of several independent p-values, corrected for their number (Šidák 1967)."""
+    """Return the smallest one of several independent p-values, corrected for their number (Šidák 1967)."""
     return float(-np.expm1(len(p) * np.log1p(-min(p)))) if min(p) < 1 else 1.0
 
 
 def compare_renderers(name: str, pictures: Pictures) -> Comparison:
-    """Compare both renderers in one photograph. Raises InputError if pixels are NaN or infinite."""
+    """Compare the pictures of both renderers for the photograph `name`.
+
+    Raises InputError if pixels are NaN or infinite.
+    """
     for which, picture in vars(pictures).items():
         if bad := int((~np.isfinite(picture)).any((0, 3)).sum()):
             raise InputError(f"{name}: {which}: {bad} pixels are NaN or infinite; check BSDF and mesh")
@@ -102,7 +106,10 @@ def compare_renderers(name: str, pictures: Pictures) -> Comparison:
 
 
 def all_as_one(rows: list[Comparison]) -> Comparison:
-    """Combine the comparisons of photographs: shares of the light in all, p-values corrected for their number."""
+    """Combine the comparisons of all photographs to one.
+
+    Its shares are of the light in all photographs. Its p-values are corrected for the number of photographs.
+    """
     column = {name: np.array([getattr(row, name) for row in rows]) for name in asdict(rows[0]) if name != "name"}
     weight = column["radiance"] / (column["radiance"].sum() or 1.0)
     shares = {name: float((weight * values).sum()) for name, values in column.items()}
@@ -121,12 +128,12 @@ def percent(x: float) -> str:
 
 
 def probability(p: float) -> str:
-    """Format a p-value with its significant digits."""
+    """Format a p-value, for example "p = 0.012"."""
     return "p < 1e-12" if p < 1e-12 else f"p = {p:.2g}"
 
 
 def comparison_table(rows: list[Comparison]) -> str:
-    """Format comparisons as text, one line each. Shares are of the mean radiance of `path`."""
+    """Format comparisons as a text table with one line each. Shares are in % of the mean radiance of `path`."""
     cells: list[tuple[str, ...]] = [(
         "", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
         "unexplained %", "p direct", "p path",
@@ -142,7 +149,11 @@ def comparison_table(rows: list[Comparison]) -> str:
 
 
 def verdict(rows: list[Comparison], everything: Comparison, significance: float) -> list[str]:
-    """Say in three sentences whether the renderers agree, and how strong shadows and interreflection are."""
+    """Return three sentences for the user: whether the renderers agree, and how strong shadows and interreflection are.
+
+    `rows`: comparisons of the photographs. `everything`: result of `all_as_one`. `significance`: p-value below which
+    the renderers disagree.
+    """
     p = probability(everything.p_direct)
     if everything.p_direct >= significance:
         direct = f"direct light agrees with path ({p})"

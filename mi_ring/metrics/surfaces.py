@@ -1,4 +1,4 @@
-"""Differences of two surfaces: normals, depths and silhouettes in photographs; distances; alignment."""
+"""Compares two surfaces: normals, depths and silhouettes in photographs, and distances in space; aligns them."""
 
 import sys
 from collections.abc import Sequence
@@ -28,7 +28,8 @@ THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
 def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
     """Read a mesh file. Returns (mesh, scene with only this mesh and smooth normals).
 
-    Raises InputError if reading fails. A mesh that is inside out is inverted, with a message on standard error.
+    A mesh that is inside out is inverted, with a message on standard error. Raises InputError if the file cannot be
+    read or has no triangles.
     """
     mesh = read_mesh(path, "mesh")
     if not len(mesh.faces):
@@ -41,9 +42,10 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 
 def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
-    """Estimate the transform (4, 4), rigid or a `similarity`, that aligns `mesh` with the nearby mesh `onto`.
+    """Estimate the transform (4, 4) that aligns `mesh` with the nearby mesh `onto`. Moves neither mesh.
 
-    Point-to-plane ICP (Chen and Medioni, 1992). Far points have small weights, because parts of `onto` may be missing.
+    `similarity`: allow a scale; otherwise the transform is rigid. The method is point-to-plane ICP (Chen and Medioni,
+    1992). Far points have small weights, because parts of `onto` may be missing.
     """
     middle, unit = onto.bounds.mean(0), onto.scale
     normalise = trimesh.transformations.scale_and_translate(1 / unit, -middle / unit)
@@ -67,9 +69,9 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Trace rays through the P pixel centres of a photograph.
+    """Trace rays through the centres of the P pixels of a photograph.
 
-    Returns (hit (P,) bool, distance (P,), normal (P, 3), whether the back of a face was hit (P,) bool).
+    Returns (hit (P,) bool, distance (P,), shading normal (P, 3), whether the ray hits the back of a face (P,) bool).
     """
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
@@ -86,11 +88,11 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
 def compare_surfaces(
     capture: Capture, guess: mi.Scene, truth: mi.Scene, diagonal: float
 ) -> tuple[dict[str, float], list[dict]]:
-    """Compare two surfaces in all photographs. Returns (errors over all views by name, list of errors by view).
+    """Compare two surfaces in all photographs. Returns (errors over all views by name, list of errors of each view).
 
-    Errors are of shading normals [deg], depths [% of `diagonal`] and silhouettes. Normals and depths count at pixels
-    that see both surfaces. `iou`: mean over views. `flipped`: share of the pixels of `guess` that see the back of a
-    face.
+    Errors are those of `error_means`, at pixels that see both surfaces, and `iou`, the intersection over union of the
+    silhouettes; over all views it is the mean. `flipped`: share of the pixels of `guess` that see the back of a face.
+    `diagonal`: unit of depth errors is 1 % of it. Raises InputError if no pixel sees both surfaces.
     """
     angles, depths, views, backs, pixels = [], [], [], 0, 0
     for k, name in enumerate(capture.names):
@@ -110,7 +112,7 @@ def compare_surfaces(
 
 
 def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
-    """Means and medians of errors (P,) of normals [deg] and depths, by name; empty if there are none."""
+    """Compute mean and median of the errors (P,) of normals [deg] and of depths. Returns them by name; {} if P is 0."""
     return {
         "normal_mean": float(angle.mean()), "normal_median": float(np.median(angle)),
         "depth_mean": float(depth.mean()), "depth_median": float(np.median(depth)),
@@ -121,12 +123,13 @@ def compare_shapes(
     guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[MaskedCamera] | None = None,
     diagonal: float | None = None,
 ) -> dict[str, float]:  # fmt: skip
-    """Compare two surfaces in space: Chamfer distance [% of `diagonal`, default: the true bounding box's] and F-scores.
+    """Compare two surfaces in space. Returns numbers by name.
 
-    They use the exact distances of 100,000 random points of each surface to the other surface. `chamfer`: mean of the
-    two mean distances. `f_score_t`: harmonic mean of precision (share of the fit's points with a distance of at most t
-    % of the diagonal) and recall (the same for the truth); Knapitsch et al., Tanks and Temples, ACM TOG 2017. With
-    `views`, only points that a view shows count; `unseen` and `unseen_true` are the shares of the others.
+    The numbers use the exact distances of 100,000 random points of each surface to the other surface. `chamfer`: mean
+    of the two mean distances [% of `diagonal`]. `f_score_t`: harmonic mean of precision and recall (Knapitsch et al.,
+    Tanks and Temples, ACM TOG 2017). Precision is the share of the points of `guess` with a distance of at most t % of
+    the diagonal; recall is the same for `truth`. `diagonal`: default: that of the bounding box of `truth`. `views`: if
+    they are given, only points that a view shows count, and `unseen` and `unseen_true` are the shares of the others.
     """
     diagonal, middle = diagonal or truth.scale, truth.bounds.mean(0)
     there, back = (100 / diagonal * distances(a, b, middle, views) for a, b in ((guess, truth), (truth, guess)))
@@ -142,7 +145,11 @@ def compare_shapes(
 def distances(
     start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
-    """Distances (n,) of random points on `start` to `end`. With `views`, only of points that a view shows."""
+    """Compute the distances (n,) of random points on `start` to the surface `end`.
+
+    `middle` (3,): a point near both surfaces, for precision. `views`: only points that a view shows are used; None:
+    all. Raises InputError if no view shows a point.
+    """
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:
         points = points[Visibility(start.vertices, start.faces, views).of_points(points, start.face_normals[faces])]

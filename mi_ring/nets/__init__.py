@@ -1,4 +1,4 @@
-"""The networks, as functions of points: encoding, perceptron, Shape-Net's flow, BRDF-Net's material.
+"""The networks as functions of points: encoding, multilayer perceptron, Shape-Net's flow and BRDF-Net's material.
 
 May import: torch.
 """

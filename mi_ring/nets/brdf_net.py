@@ -32,9 +32,9 @@ COOK_TORRANCE = (
 
 
 class MaterialNet(nn.Module):
-    """Base class of BRDF-Net: maps a domain point to the parameters of a BSDF, each within its range.
+    """Base class of BRDF-Net: a network that maps a point of the domain to the parameters of a BSDF.
 
-    A subclass with a method `evaluate` can replace BRDF-Net. Its initial outputs should be about 0.
+    Each parameter stays within its range. To replace BRDF-Net, derive a class with a method `evaluate`.
     """
 
     bsdf_parameters: tuple[Parameter, ...]
@@ -46,24 +46,27 @@ class MaterialNet(nn.Module):
         self.set_parameters(parameters, scale)
 
     def set_parameters(self, parameters: Sequence[Parameter], scale: float) -> None:
-        """Set the parameters that `evaluate` predicts, in the order of its outputs. A colour takes three outputs."""
+        """Set the BSDF parameters that the network predicts, and `scale`, the order of magnitude of the reflectances.
+
+        The parameters are in the order of the outputs of `evaluate`. A colour takes three outputs.
+        """
         self.bsdf_parameters = tuple(Parameter(*p) for p in parameters)
         self.scale.fill_(scale)
 
     @property
     def outputs(self) -> int:
-        """The number of outputs that the parameters need."""
+        """Number of values that `evaluate` must return per point: one or three for each parameter."""
         return sum(p.channels for p in self.bsdf_parameters)
 
     def evaluate(self, s: Tensor) -> Tensor:
-        """Compute unbounded values (..., outputs) at domain points (..., 3); initially about 0."""
+        """Compute unbounded values (..., `outputs`) at domain points (..., 3). They should be about 0 before a fit."""
         raise NotImplementedError
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
-        """Compute the parameters by name at domain points (..., 3): (..., 3) for colours, otherwise (...).
+        """Compute the parameters at domain points (..., 3). Returns tensors by name: (..., 3) for colours, else (...).
 
-        A sigmoid maps outputs to the range of a parameter. Without an upper limit, softplus times `scale` does, so that
-        outputs are about 1 in any unit of light.
+        A sigmoid maps the output of `evaluate` to the range of a parameter. If the range has no upper limit, softplus
+        times `scale` maps it, so that the outputs are about 1 in any unit of light.
         """
         raw = self.evaluate(s).float().split([p.channels for p in self.bsdf_parameters], -1)
         result = {}
@@ -78,9 +81,9 @@ class MaterialNet(nn.Module):
 
 @register_network("brdfnet")
 class BRDFNet(MLP, MaterialNet):
-    """Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r) or the parameters of another BSDF: an MLP of 1,285 neurons.
+    """The paper's BRDF-Net, an MLP of 1,285 neurons: Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r), or the parameters of another BSDF.
 
-    Its input is the domain point s, not the deformed point.
+    The input is the point s of the domain, not the point of the deformed surface.
     """
 
     def __init__(
@@ -91,5 +94,5 @@ class BRDFNet(MLP, MaterialNet):
         self.set_parameters(parameters, scale)
 
     def arguments(self) -> dict:
-        """The arguments of the constructor, except `scale`, which is saved with the weights."""
+        """Return the arguments of the constructor by name, to save them. `scale` is saved with the weights instead."""
         return {"parameters": [tuple(p) for p in self.bsdf_parameters], **self.encoding.arguments()}

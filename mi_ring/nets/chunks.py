@@ -1,4 +1,4 @@
-"""Evaluation of networks in chunks of points, one per thread, on all cores of the processor."""
+"""Evaluates networks in chunks of points on all cores of the processor; each thread computes one chunk at a time."""
 
 import os
 import threading
@@ -18,10 +18,12 @@ _lock = threading.Lock()
 
 
 def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Tensor:
-    """Compute the values of a network at points (n, 3) in chunks of equal size, one per thread.
+    """Compute the values of a network at points (n, 3), in chunks of equal size. Returns a tensor (n, …).
 
-    `forward(chunk, keep)` returns the values of a chunk and, with `keep`, the data for the backward pass. For more than
-    `MAX_STORED` points the backward pass computes this data again, to save memory. A GPU uses a single chunk.
+    `ctx`: context of the autograd function; it receives the data for `backward_in_chunks`. `forward(chunk, keep)`
+    returns (values of the chunk; data for the backward pass if `keep`, else anything). `keep`: a backward pass will
+    follow. For more than `MAX_STORED` points the backward pass computes this data again, to save memory. On a GPU there
+    is a single chunk.
     """
     chunks = 1
     ctx.recompute = forward if keep and len(x) > MAX_STORED and x.device.type == "cpu" else None
@@ -37,10 +39,12 @@ def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Ten
 
 
 def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Compute the gradients of the points (n, 3) and of the parameters of `ctx.layers`.
+    """Compute the gradients with respect to the points and to the parameters of `ctx.layers`.
 
-    `backward(gradient, stored, sums)` returns the gradient of the points of a chunk and adds the gradients of the
-    parameters to `sums`. Raises RuntimeError for a second call, and if parameters changed after the forward pass.
+    Returns (gradient (n, 3) of the points, list of the gradients of the parameters). `ctx`: the context that was given
+    to `forward_in_chunks`. `gradient` (n, …): gradient of the values. `backward(gradient, stored, sums)` returns the
+    gradient of the points of one chunk and adds the gradients of the parameters to `sums`. Raises RuntimeError for a
+    second call, and if a parameter has changed since the forward pass.
     """
     _ = ctx.saved_tensors  # lets torch check for changes: the layers may share memory with the parameters
     if ctx.stored is None:
@@ -60,7 +64,10 @@ def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[
 
 
 def in_parallel(function: Callable, *arguments: Sequence) -> list:
-    """Call `function` like `map`, in worker threads, each of which uses one thread of torch."""
+    """Call `function` with the first items of all `arguments`, then with the second items, and so on, in threads.
+
+    Returns the list of results. In each worker thread, torch uses one thread.
+    """
     threads = min(torch.get_num_threads(), len(arguments[0]))
     if threads == 1:
         return list(map(function, *arguments))
@@ -68,7 +75,7 @@ def in_parallel(function: Callable, *arguments: Sequence) -> list:
 
 
 def pool(threads: int) -> ThreadPoolExecutor:
-    """The pool of worker threads of this process, with at least `threads` threads."""
+    """Return this process's pool of worker threads. If it has fewer than `threads` threads, make a new pool."""
     global _pool
     with _lock:
         if _pool is None or _pool[0] != os.getpid() or _pool[1] < threads:  # a fork does not copy threads
@@ -88,6 +95,6 @@ def pool(threads: int) -> ThreadPoolExecutor:
 
 
 def use_one_thread() -> None:
-    """Let torch use one thread for the computations of the current thread."""
+    """Make torch use one thread for all computations that the current thread starts."""
     torch.get_num_threads()  # the first call copies the number of the process, which would undo the next line
     torch.set_num_threads(1)

@@ -5,11 +5,11 @@ from torch import Tensor, nn
 
 
 class PosEnc(nn.Module):
-    """PosEnc(x) = [cos(ωx), sin(ωx)] maps points (..., 3) to features (..., 6 · frequencies).
+    """Positional encoding: PosEnc(x) = [cos(ωx), sin(ωx)] maps points (..., 3) to features (..., 6 · frequencies).
 
-    `spacing`: with "linear", as in the paper, ω = 1, 2, …, frequencies; with "octaves", as in NeRF, ω = 1, 2, 4, …,
-    2^(frequencies − 1); with "none" the features are the points. Order of the features: all cosines, then all sines;
-    within each ω₁x, ω₁y, ω₁z, ω₂x, …
+    `spacing`: "linear", as in the paper: ω = 1, 2, …, frequencies. "octaves", as in NeRF: ω = 1, 2, 4, …,
+    2^(frequencies − 1). "none": the features are the points themselves. The features are first all cosines, then all
+    sines. The order within both is ω₁x, ω₁y, ω₁z, ω₂x, … Raises ValueError for another `spacing`.
     """
 
     def __init__(self, frequencies: int = 16, spacing: str = "linear") -> None:
@@ -20,23 +20,29 @@ class PosEnc(nn.Module):
         self.width = 3 if spacing == "none" else 6 * frequencies
 
     def arguments(self) -> dict:
-        """The arguments of the constructor, by the names that the networks use."""
+        """Return {"encoding": `spacing`, "frequencies": `frequencies`}.
+
+        These are the encoding's arguments in the constructors of Shape-Net and BRDF-Net.
+        """
         return {"encoding": self.spacing, "frequencies": self.frequencies}
 
     def omega(self, dtype: torch.dtype, device: torch.device) -> Tensor:
-        """The frequencies ω, (frequencies,), as a tensor."""
+        """Return the frequencies ω as a tensor (frequencies,)."""
         k = torch.arange(self.frequencies, dtype=dtype, device=device)
         return 2**k if self.spacing == "octaves" else k + 1
 
     def forward(self, x: Tensor) -> Tensor:
-        """Compute the features of points (..., 3)."""
+        """Compute the features (..., `width`) of points (..., 3)."""
         if self.spacing == "none":
             return x
         phase = (x[..., None, :] * self.omega(x.dtype, x.device)[:, None]).flatten(-2)
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
     def backward(self, features: Tensor, gradient: Tensor) -> Tensor:
-        """The gradient (n, 3) of the points from the `gradient` (n, width) of the features; at least float32."""
+        """Compute the gradient (n, 3) with respect to the points, in float32 or float64.
+
+        `features` (n, width): the result of `forward`. `gradient` (n, width): the gradient with respect to them.
+        """
         dtype = torch.promote_types(features.dtype, torch.float32)
         if self.spacing == "none":
             return gradient.to(dtype)

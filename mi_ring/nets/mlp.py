@@ -1,4 +1,4 @@
-"""The multilayer perceptron of both networks, with derivatives written by hand for speed."""
+"""The multilayer perceptron of both networks. Its derivatives are written by hand, for speed."""
 
 import contextlib
 import contextvars
@@ -21,7 +21,7 @@ SLOPE = 0.01  #: of the leaky ReLU
 
 @contextlib.contextmanager
 def plain_autograd() -> Iterator[None]:
-    """A context manager in which networks use PyTorch's own derivatives: slower, but of any order.
+    """Context manager in which networks use PyTorch's own derivatives. They are slower, but of any order.
 
     Use it for Jacobians, second derivatives and `torch.func` (`jacrev`, `vmap`, …).
     """
@@ -33,7 +33,10 @@ def plain_autograd() -> Iterator[None]:
 
 
 class MLP(nn.Module):
-    """A perceptron of a point: encoding, `depth` hidden layers with leaky ReLU, linear layer with `outputs`."""
+    """A multilayer perceptron of points: encoding, `depth` hidden layers, and a linear layer with `outputs` outputs.
+
+    The hidden layers have `width` neurons with leaky ReLU. Default of `encoding`: `PosEnc()`.
+    """
 
     def __init__(self, depth: int, outputs: int, encoding: PosEnc | None = None, width: int = WIDTH) -> None:
         super().__init__()
@@ -43,9 +46,10 @@ class MLP(nn.Module):
         self.output = nn.Linear(width, outputs)
 
     def evaluate(self, x: Tensor) -> Tensor:
-        """The outputs (..., outputs) at points (..., 3); in bfloat16 under `torch.autocast`.
+        """Compute the outputs (..., outputs) at points (..., 3). Under `torch.autocast` they are bfloat16.
 
-        They allow one backward pass and first derivatives; within `plain_autograd`, any number of both.
+        They allow one backward pass, for first derivatives. Within `plain_autograd` they allow several passes and
+        derivatives of any order.
         """
         if _plain.get():
             x = self.encoding(x)
@@ -56,9 +60,10 @@ class MLP(nn.Module):
         return values.reshape(*x.shape[:-1], self.output.out_features)
 
     def operands(self, x: Tensor) -> list:
-        """Collect the last arguments of `_Evaluate` and of `_EulerSteps`.
+        """List the arguments that `_Evaluate` and `_EulerSteps` both take last.
 
-        They are: encoding, type of the matrix products, whether gradients are needed, weights and biases by layer.
+        They are: the encoding; the number format of matrix products at points like `x`; whether gradients are needed;
+        weight and bias of each layer.
         """
         dtype = self.hidden[0](self.encoding(x.reshape(-1, 3)[:0])).dtype  # as autocast decides
         parameters = [p for layer in [*self.hidden, self.output] for p in (layer.weight, layer.bias)]
@@ -66,16 +71,21 @@ class MLP(nn.Module):
 
 
 class Layers:
-    """The layers of an MLP in the precision of the matrix products, with `forward` and `backward`."""
+    """The layers of an MLP, for passes without PyTorch's autograd.
+
+    `dtype`: number format of the matrix products. `parameters`: weight and bias of each layer; they are copied to this
+    format.
+    """
 
     def __init__(self, encoding: PosEnc, dtype: torch.dtype, parameters: Sequence[Tensor]) -> None:
         self.encoding, self.dtype = encoding, dtype
         self.weights, self.biases = ([p.detach().to(dtype) for p in parameters[k::2]] for k in (0, 1))
 
     def forward(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
-        """Compute activations and output at points (n, 3).
+        """Compute (activations, output (n, outputs)) at points (n, 3).
 
-        Activations are those of the encoding and all hidden layers; without `keep`, of the last hidden layer alone.
+        `keep`: return the activations of the encoding and of all hidden layers, for `backward`. Otherwise only those of
+        the last hidden layer are returned.
         """
         activations = [self.encoding(x).to(self.dtype)]
         for w, b in zip(self.weights[:-1], self.biases):
@@ -85,12 +95,15 @@ class Layers:
         return activations, F.linear(activations[-1], self.weights[-1], self.biases[-1])
 
     def zeros(self) -> list[Tensor]:
-        """Zeros for the sums of the parameters' gradients; at least float32."""
+        """Return a tensor of zeros for the gradient of each parameter, in float32 or float64."""
         dtype = torch.promote_types(self.dtype, torch.float32)
         return [torch.zeros_like(p, dtype=dtype) for pair in zip(self.weights, self.biases) for p in pair]
 
     def backward(self, gradient: Tensor, activations: list[Tensor], sums: list[Tensor]) -> Tensor:
-        """The gradient of the points from the `gradient` of the output. Adds the parameters' gradients to `sums`."""
+        """Compute the gradient (n, 3) with respect to the points. Adds the gradients of the parameters to `sums`.
+
+        `gradient` (n, outputs): gradient with respect to the output. `activations`: from `forward` with `keep`.
+        """
         gradient = gradient.to(self.dtype)
         for k in reversed(range(len(self.weights))):
             sums[2 * k] += gradient.T @ activations[k]

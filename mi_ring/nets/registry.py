@@ -1,4 +1,4 @@
-"""Networks by name: `ring.pt` stores names of networks instead of pickled classes."""
+"""Registers classes of networks by name: `ring.pt` stores these names instead of pickled classes."""
 
 from collections.abc import Callable
 from importlib.metadata import entry_points
@@ -14,11 +14,12 @@ _networks: dict[str, type[nn.Module]] = {}
 
 
 def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
-    """A decorator that registers a class of networks under the `name` by which `ring.pt` refers to it.
+    """Return a decorator that registers a class of networks under `name`. `ring.pt` stores this name.
 
-    The class may have a method `arguments`, which returns the arguments of its constructor as a dictionary of plain
-    data. Weights are saved by `state_dict`. Networks of other packages are found without an import if they are entry
-    points of the group `mi_ring.networks`. Raises ValueError if another class has the name.
+    The class may have a method `arguments`. It returns the arguments of the constructor as a dictionary of plain data,
+    which `ring.pt` stores together with the weights (`state_dict`). Another package may offer a network as an entry
+    point of the group `mi_ring.networks`; then the user need not import the package. The decorator raises ValueError if
+    another class has this name.
     """
 
     def register(network: type[nn.Module]) -> type[nn.Module]:
@@ -32,12 +33,15 @@ def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
 
 
 def qualified_name(network: type) -> tuple[str, str]:
-    """Module and name of a class. They are equal if a notebook cell defines the class again."""
+    """Return (module, name) of a class. Both stay the same if a notebook cell defines the class again."""
     return network.__module__, network.__qualname__
 
 
 def architecture_of(network: nn.Module) -> dict:
-    """The registered name and the arguments of a network, for `build`. Raises ValueError if it is not registered."""
+    """Describe a network for `build`: {"name": its registered name, "arguments": those of its constructor}.
+
+    Raises ValueError if the class of the network is not registered.
+    """
     for name, known in _networks.items():
         if qualified_name(type(network)) == qualified_name(known):
             arguments = getattr(network, "arguments", None)
@@ -47,7 +51,10 @@ def architecture_of(network: nn.Module) -> dict:
 
 
 def build(architecture: dict) -> Any:
-    """A network of an architecture, with random weights. Raises InputError if its name is not registered."""
+    """Make a network with random weights. `architecture`: from `architecture_of`.
+
+    Raises InputError if the name in it is not registered.
+    """
     name = architecture["name"]
     for entry in entry_points(group=GROUP, name=name) if name not in _networks else ():
         register_network(name)(entry.load())

@@ -1,4 +1,4 @@
-"""A plain ResNet in place of Shape-Net, for the paper's ablation: its blocks do not share weights."""
+"""A plain ResNet that can replace Shape-Net, for the paper's ablation. Its blocks do not share weights."""
 
 from typing import Any
 
@@ -12,10 +12,10 @@ from mi_ring.nets.shape_net import Flow, ShapeNet, Velocity, VelocityField
 
 @register_network("resnet")
 class ResNet(Flow):
-    """A plain ResNet: T = `steps` blocks `x ← x + Vₖ(x) / T` with own weights, not the flow of one velocity field.
+    """A plain ResNet of T = `steps` blocks `x ← x + Vₖ(x) / T`. Each block k has its own weights.
 
-    By default all blocks together have as many parameters as Shape-Net: for T = 20 they are about 42 neurons wide.
-    `width`: neurons per layer of each block; with Shape-Net's 256 there are T times as many parameters.
+    `width`: neurons per layer of each block. Default: so many that all blocks together have as many parameters as
+    Shape-Net; this is about 42 for T = 20. With 256, the width of Shape-Net, the ResNet has T times as many parameters.
     """
 
     def __init__(
@@ -28,19 +28,19 @@ class ResNet(Flow):
         self.blocks = nn.ModuleList(VelocityField(self.encoding, w) for w in widths)
 
     def arguments(self) -> dict:
-        """The arguments of the constructor."""
+        """Return the arguments of the constructor by name, to save them."""
         return {"steps": self.steps, "width": self.width, **self.encoding.arguments()}
 
     def velocity_of(self, step: int) -> Velocity:
-        """The velocity field Vₖ of block k = `step`."""
+        """Return the velocity field Vₖ of block k = `step`."""
         block: Any = self.blocks[step]
         return block.velocity
 
 
 def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
-    """Widths of blocks that together have about as many parameters as one block of width `WIDTH`.
+    """Choose the widths of `blocks` blocks that together have about as many parameters as one block of width `WIDTH`.
 
-    The first blocks are one neuron wider than the others, for the smallest difference.
+    Returns a list of widths. The first blocks are one neuron wider than the others where this reduces the difference.
     """
 
     def parameters(width: int) -> int:
@@ -54,7 +54,11 @@ def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
 
 
 def shape_net_of(kind: str, steps: int, encoding: str, frequencies: int) -> Flow:
-    """Shape-Net (`ring`), a ResNet with as many parameters (`resnet`), or a ResNet of its width (`wide-resnet`)."""
+    """Make the network that deforms the domain. `kind`: a value of `Config.shape_net`.
+
+    "ring" is Shape-Net. "resnet" is a plain ResNet with as many parameters. "wide-resnet" is a plain ResNet as wide as
+    Shape-Net.
+    """
     if kind == "ring":
         return ShapeNet(steps, encoding, frequencies)
     return ResNet(steps, encoding, frequencies, WIDTH if kind == "wide-resnet" else None)

@@ -1,4 +1,4 @@
-"""Shape-Net: a recurrent ResNet that integrates a flow from the domain to the object (paper, section 3)."""
+"""Shape-Net: a recurrent ResNet. It integrates a flow that deforms the domain into the object (paper, section 3)."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,11 +18,11 @@ Velocity = Callable[[Tensor], Tensor]
 
 
 class Flow(nn.Module):
-    """The flow Φ(x, t) = x + ∫₀ᵗ V(Φ(x, s)) ds of a time-invariant velocity field V, by Euler steps.
+    """Base class of Shape-Net: the flow Φ(x, t) = x + ∫₀ᵗ V(Φ(x, s)) ds of a velocity field V, by Euler steps.
 
-    Base class of Shape-Net. To replace Shape-Net, derive a class with a method `velocity`, or write a module with
-    `forward`, `velocity`, `flow` and `steps`. Points are in the normalised frame, where the domain is about the unit
-    sphere. The initial velocity should be small, so that the fit starts from the domain.
+    V does not depend on time. To replace Shape-Net, derive a class with a method `velocity`, or write a module with
+    `forward`, `velocity`, `flow` and `steps`. Points are in the normalised frame, in which the domain is about as large
+    as the unit sphere. The initial velocity should be small, so that the fit starts from the domain.
     """
 
     steps: int = 20  #: T: steps from the domain to the object
@@ -32,27 +32,30 @@ class Flow(nn.Module):
         raise NotImplementedError
 
     def velocity_of(self, step: int) -> Velocity:
-        """The velocity field of a step, counted from 0. Only a plain ResNet has a different one for each step."""
+        """Return the velocity field V of Euler step number `step`, counted from 0.
+
+        A plain ResNet has another field for each step. All other networks have one field.
+        """
         return self.velocity
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """Φ(x, steps / T) for points (V, 3): the first `steps` of T Euler steps `x ← x + V(x) / T`."""
+        """Compute Φ(x, steps / T) for points (V, 3), by the first `steps` of the T Euler steps `x ← x + V(x) / T`."""
         for step in range(steps):
             x = x + 1 / self.steps * self.velocity_of(step)(x)
         return x
 
     def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
-        """Φ(x, time) for points (V, 3), `time` in [0, 1]. The last step is shorter if `time` is between two steps."""
+        """Compute Φ(x, time) for points (V, 3) and a `time` in [0, 1]. Between two steps, the last one is shorter."""
         steps = int(time * self.steps)
         x, rest = self.flow(x, steps) if steps else x, time - steps / self.steps
         return x + rest * self.velocity_of(steps)(x) if rest else x
 
 
 class VelocityField(MLP):
-    """The velocity field V: an MLP, of 771 neurons in the paper.
+    """The velocity field V: an MLP. In the paper it has 771 neurons.
 
-    It is bounded by `SPEED`, by tanh, as in the authors' "Diffeomorphic Neural Surface Parameterization", SIGGRAPH
-    2022. It is initially almost 0, so that the start surface is the domain.
+    A tanh limits each component to `SPEED`, as in the authors' "Diffeomorphic Neural Surface Parameterization",
+    SIGGRAPH 2022. The initial velocity is almost 0, so that the fit starts from the domain.
     """
 
     def __init__(self, encoding: PosEnc | None = None, width: int = WIDTH) -> None:
@@ -68,20 +71,21 @@ class VelocityField(MLP):
 
 @register_network("shapenet")
 class ShapeNet(VelocityField, Flow):
-    """The paper's flow: one velocity field for all steps."""
+    """The paper's Shape-Net: all steps use one velocity field."""
 
     def __init__(self, steps: int = 20, encoding: str = "linear", frequencies: int = 16) -> None:
         super().__init__(PosEnc(frequencies, encoding))
         self.steps = steps
 
     def arguments(self) -> dict:
-        """The arguments of the constructor."""
+        """Return the arguments of the constructor by name, to save them."""
         return {"steps": self.steps, **self.encoding.arguments()}
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """Compute `Flow.flow`, with matrix products in bfloat16 under `torch.autocast`.
+        """Compute the same as `Flow.flow`, faster. Under `torch.autocast`, matrix products are in bfloat16.
 
-        It allows one backward pass and first derivatives; within `plain_autograd`, any number of both.
+        The result allows one backward pass, for first derivatives. Within `plain_autograd` it allows several passes and
+        derivatives of any order.
         """
         if _plain.get():
             return super().flow(x, steps)

@@ -1,4 +1,4 @@
-"""A fitted object: the two networks with their domain, its file `ring.pt`, and edits of its material.
+"""A fitted object (two networks and their domain), the file `ring.pt` that stores it, and edits of its material.
 
 May import: mitsuba, numpy, torch, trimesh; rendering, scene, nets, geometry, system.
 """

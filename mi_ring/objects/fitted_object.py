@@ -1,4 +1,4 @@
-"""A reconstructed object: both networks, the domain and the normalisation."""
+"""A fitted object: both networks, the domain and the normalisation."""
 
 from collections.abc import Sequence
 
@@ -20,14 +20,17 @@ from mi_ring.scene.shot import Shot
 
 
 class FittedObject(nn.Module):
-    """A surface x(s) = center + radius · Φ(s) with a material Ψ(s) at every point s of the domain.
+    """A fitted object: the surface x(s) = center + radius · Φ(s) with the material Ψ(s), for points s of the domain.
 
-    `center` (3,) and `radius` are in scene units. `bsdf` is the BSDF that reads `parameters`, as Mitsuba's XML.
-    `indirect`: whether the fit and pictures include interreflection. `subdivisions`: level at which to sample the
-    surface; finer levels are less certain. `networks` replace the paper's networks, which are made from `steps`,
+    `center` (3,), `radius`: normalising sphere [scene units]. `domain`: the start surface; default: the unit sphere.
+    `parameters`: the BSDF parameters that Ψ predicts. `bsdf`: Mitsuba's XML of the BSDF that reads them. `indirect`:
+    the fit and its pictures include interreflection. `subdivisions`: level of the mesh at which the fit has sampled the
+    surface. `networks`: (Shape-Net Φ, BRDF-Net Ψ). Without them, the networks of the paper are made from `steps`,
     `scale` and `parameters`; see `mi_ring.nets.shape_net.Flow` and `mi_ring.nets.brdf_net.MaterialNet`.
-    `ground` (2, 3): a point of the table below the object and the table's unit normal; points below the table are moved
-    up to it. `up` (3,) and `metres`, the length of a scene unit, are for exports; None if unknown.
+
+    `ground` (2, 3): a point of the table below the object and the table's unit normal. Surface points below the table
+    are moved up to the table. `up` (3,), the up direction, and `metres`, the length of a scene unit [m], are for
+    exports. These three are None if unknown.
     """
 
     shape_net: Flow
@@ -54,26 +57,29 @@ class FittedObject(nn.Module):
         self.metres = None if metres is None else float(metres)
 
     def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
-        """Compute the surface points (V, 3) [scene units] of domain points (V, 3), at a `time` of the flow."""
+        """Compute the surface points (V, 3) [scene units] of the domain points `s` (V, 3).
+
+        `time`: of the deformation. 0: the domain. 1: the finished object.
+        """
         return self.to_scene(self.shape_net(s, time))
 
     def material(self, s: Tensor) -> dict[str, Tensor]:
-        """Compute the parameters of the BSDF by name, (V, 3) or (V,), at domain points (V, 3)."""
+        """Compute the BSDF parameters at the domain points `s` (V, 3). Returns tensors (V, 3) or (V,) by name."""
         return self.brdf_net(s)
 
     def forward(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute `surface` and `material` at domain points (V, 3)."""
+        """Return (`surface`, `material`) at the domain points `s` (V, 3)."""
         return self.surface(s, time), self.material(s)
 
     def render(
         self, camera: Camera, light: Light | None = None, spp: int = 16, level: int | None = None, shadows: bool = True,
         seed: int = 0,
     ) -> Tensor:  # fmt: skip
-        """Render a picture (H, W, 3) of the camera's size: linear radiance by direct light.
+        """Render a picture (H, W, 3) of linear radiance under direct light. The camera gives its size.
 
-        `light`: default: a point light of intensity 1 at the camera. `level`: of the mesh; default: `subdivisions`.
-        `spp`: samples per pixel. The picture allows one backward pass to the parameters of both networks. Gradients
-        include moving outlines and shadows.
+        `light`: default: a point light of intensity 1 at the camera. `spp`: samples per pixel. `level`: level of the
+        mesh; default: `subdivisions`. `shadows`: the object casts shadows on itself. The picture allows one backward
+        pass to the parameters of both networks. Its gradients include moving outlines and shadows.
         """
         shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
         surface = Surface(assembled([shape]), shape, self)
@@ -84,7 +90,7 @@ class FittedObject(nn.Module):
         return prediction.render(surface, shot, vertices, material, spp, seed, shadows)[0][0]
 
     def to_scene(self, points: Tensor) -> Tensor:
-        """Convert points (V, 3) of the normalised frame to scene units. Points below the ground are moved up to it."""
+        """Convert points (V, 3) from the normalised frame to scene units. Points below the table are moved up to it."""
         points = self.center + self.radius * points
         if self.ground is None:
             return points

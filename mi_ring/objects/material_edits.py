@@ -1,4 +1,4 @@
-"""Edits of fitted materials, and their transfer between objects."""
+"""Edits fitted materials and transfers them to other objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,19 +23,22 @@ class MaterialOptions:
     """Options that change the material of an object."""
 
     material: Path | None = None
-    """Results folder of another fit. The object gets the material of that fit. Without it: its own material.
+    """Results folder of another fit. The object gets the material of that fit. Without this option: its own material.
     Both fits must start from the same surface, or from surfaces without handles (like a sphere, not like a ring)."""
     specular_scale: float = 1.0
-    """Factor for the specular reflectance, 0 or more. Above 1, for example 2: stronger highlights. 0: no highlights."""
+    """Factor of the specular reflectance, 0 or more. Above 1, for example 2: stronger highlights. 0: no highlights."""
     roughness_add: float = 0.0
-    """Number to add to the roughness, for example 0.1 or -0.1. Above 0: wider highlights. Below 0: sharper ones.
-    The sum stays within the range that the material allows, at most 0 to 1."""
+    """Number to add to the roughness, for example 0.1 or -0.1. Above 0: wider highlights. Below 0: narrower highlights.
+    The command clips the sum to the range of the material's roughness, at most 0 to 1."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors for red, green and blue of the object's colours, 0 or more. 1 1 1: no change. 1 0.8 0.8: redder."""
+    """Factors of red, green and blue in the object's colours, 0 or more. 1 1 1: no change. 1 0.8 0.8: more red."""
 
 
 def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
-    """Apply the options to the material of an object. Raises InputError if the material does not allow them."""
+    """Change the material of `ring` in place, as the options say.
+
+    Raises InputError if an option is out of range, or if the material lacks the parameter that an option changes.
+    """
     if options.material:
         other = load_fit(options.material)
         ring.bsdf, ring.brdf_net = other.bsdf, other.brdf_net
@@ -65,7 +68,10 @@ def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
 
 
 def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> list[str]:
-    """The parameters of the material that are among `names`. Raises InputError if there is none."""
+    """List the parameters of the object's material whose name is among `names`.
+
+    Raises InputError, which begins with the `option`, if there is no such parameter.
+    """
     parameters = [p.name for p in ring.brdf_net.bsdf_parameters]
     found = [name for name in parameters if name in names]
     if not found:
@@ -74,7 +80,10 @@ def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> l
 
 
 class TransferredMaterial(MaterialNet):
-    """A BRDF-Net of the domain `there`, evaluated on the domain `here`. Both are mapped to the sphere."""
+    """Evaluates the BRDF-Net `net` of the domain `there` at points of another domain, `here`.
+
+    The maps of both domains to the unit sphere give corresponding points.
+    """
 
     def __init__(self, net: MaterialNet, here: SphericalMap, there: SphericalMap) -> None:
         super().__init__(net.bsdf_parameters, float(net.scale))
@@ -86,7 +95,10 @@ class TransferredMaterial(MaterialNet):
 
 
 class EditedMaterial(MaterialNet):
-    """A BRDF-Net with gains and offsets by parameter name. Values stay within the parameters' ranges."""
+    """Evaluates the BRDF-Net `net`, and multiplies each parameter by its gain and adds its offset.
+
+    `gains`, `offsets`: by name of the parameter. Results are clipped to the ranges of the parameters.
+    """
 
     def __init__(self, net: MaterialNet, gains: dict, offsets: dict) -> None:
         super().__init__(net.bsdf_parameters, float(net.scale))

@@ -1,4 +1,4 @@
-"""`ring.pt`: the file of a reconstructed object. It stores networks by their registered names."""
+"""Reads and makes the content of `ring.pt`, the file of a fitted object. It stores networks by registered names."""
 
 import io
 import math
@@ -23,7 +23,10 @@ ADVICE = "give the results folder of a fit, or its ring.pt"
 
 
 def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
-    """Make the content of `ring.pt`, for `write_state`. Raises ValueError for networks that are not registered."""
+    """Make the content of `ring.pt` as a dictionary, for `write_state`. Writes no file. `config`: settings of the fit.
+
+    Raises ValueError if a network is not registered.
+    """
     domain = None
     if not isinstance(ring.domain, Sphere):  # as tensors: torch loads no numpy arrays with `weights_only`
         domain = {"points": torch.tensor(ring.domain.points), "faces": torch.tensor(ring.domain.faces)}
@@ -36,10 +39,10 @@ def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
 
 
 def ring_of(state: dict) -> FittedObject:
-    """Make the object of a state: the inverse of `ring_state`.
+    """Make a fitted object from the content of `ring.pt`, a dictionary from `ring_state`.
 
-    Raises InputError for networks that are not registered and for removed settings of older versions. If the state is
-    damaged, raises KeyError, RuntimeError, TypeError or ValueError.
+    Raises InputError if a network is not registered, and for settings of older versions that were removed. Raises
+    KeyError, RuntimeError, TypeError or ValueError if the state is damaged.
     """
     refuse("material_at", state.get("material_at", "domain"), "domain")
     shape_net = state["shape_net"]
@@ -61,14 +64,17 @@ def ring_of(state: dict) -> FittedObject:
 
 
 def refuse(name: str, found: object, supported: str) -> None:
-    """Raise InputError unless a setting of an older version has the only value that is still supported."""
+    """Raise InputError if a setting of an older version has a value that this version does not support.
+
+    `name`: the setting. `found`: its value. `supported`: the only value that is allowed.
+    """
     if found != supported:
         raise InputError(f"{name}: is {found}, only {supported} is supported; fit again, or use the version of mi_ring "
                          "that wrote this file")  # fmt: skip
 
 
 def require_valid(ring: FittedObject) -> None:
-    """Raise ValueError for values that no fit gives: damaged or forged files."""
+    """Raise ValueError if the object has a value that no fit produces, because its file is damaged or forged."""
     for name, value in [*ring.named_parameters(), *ring.named_buffers()]:
         require(bool(value.isfinite().all()), f"{name} is not finite")
     require(float(ring.radius) > 0, f"the radius is {float(ring.radius):.4g}")
@@ -87,13 +93,13 @@ def require_valid(ring: FittedObject) -> None:
 
 
 def require(condition: bool, otherwise: str) -> None:
-    """Raise ValueError, with the message `otherwise`, unless the condition holds."""
+    """Raise ValueError with the message `otherwise` if the condition is false."""
     if not condition:
         raise ValueError(otherwise)
 
 
 def upgraded(state: dict) -> dict:
-    """A state of format 3, which mi_ring 0.1 wrote, converted to the present format."""
+    """Convert a state of format 3, which mi_ring 0.1 wrote, to the present format. Returns a new dictionary."""
     return state | {
         "format": FORMAT, "shape_net": {"name": "shapenet", "arguments": {"steps": state["steps"]}},
         "brdf_net": {"name": "brdfnet", "arguments": {"parameters": state["parameters"]}},
@@ -102,9 +108,11 @@ def upgraded(state: dict) -> dict:
 
 
 def read_state(path: Path, kind: str, advice: str) -> dict:
-    """A state that `write_state` wrote. Raises InputError if the file is missing, damaged or not `kind`.
+    """Read a file that `write_state` wrote. Returns its content, a dictionary.
 
-    Files of 0.1 have only the checksums of the zip format.
+    `kind`, `advice`: for messages: what the file should be, and what the user can do. Raises InputError if the file is
+    missing, damaged or of another kind. Damage is found by the checksum of the file. Files of mi_ring 0.1 have only the
+    checksums of the zip format.
     """
     try:
         content = path.read_bytes()
@@ -129,9 +137,10 @@ def read_state(path: Path, kind: str, advice: str) -> dict:
 
 
 def load_fit(path: str | Path) -> FittedObject:
-    """Load the object of a fit, from its results folder or its `ring.pt`.
+    """Load the object of a fit. `path`: the results folder of the fit, or its `ring.pt`.
 
-    Raises InputError if there is no such file, if its version cannot be read, or if its networks are not registered.
+    Raises InputError if there is no such file, if it is damaged, if this version of mi_ring cannot read its format, or
+    if its networks are not registered.
     """
     path = Path(path)
     path = path / "ring.pt" if path.is_dir() else path

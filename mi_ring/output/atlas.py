@@ -1,4 +1,4 @@
-"""Texture atlases: the fitted surface is unwrapped, and the networks are baked into images."""
+"""Texture atlases: unwraps the fitted surface, and bakes the networks into images."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -35,7 +35,8 @@ class Atlas(NamedTuple):
 def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
     """Unwrap the surface for square textures with sides of `resolution` texels, by xatlas (Young 2018, after Thekla).
 
-    `subdivisions`: level of the mesh. `time`: of the flow, in [0, 1].
+    `subdivisions`: level of the mesh. `time`: of the deformation, 0 to 1. Raises InputError if the package xatlas is
+    not installed.
     """
     points, faces = ring.domain.sample(min(subdivisions, MAX_CUT_LEVEL))
     xatlas = need("xatlas", "textures")
@@ -52,7 +53,10 @@ def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: 
 
 
 def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
-    """Map domain points (V, 3) to the surface at `time` of the flow: points (V, 3) in the normalised frame."""
+    """Map domain points `s` (V, 3) to the surface. Returns points (V, 3) in the normalised frame.
+
+    `time`: of the deformation, 0 to 1.
+    """
     with torch.no_grad():
         return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
 
@@ -60,9 +64,10 @@ def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndar
 def subdivide(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Subdivide every triangle into four. Returns `s`, `uv`, `faces` and `more` of the new mesh.
+    """Subdivide every triangle into four. Returns (`s`, `uv`, `faces`, `more`…) of the new mesh.
 
-    New vertices `s` are on the domain; `uv` (V, 2) and `more` (V, n) are interpolated.
+    The mesh: domain points `s` (V, 3), texture coordinates `uv` (V, 2), triangles `faces` (F, 3), and other arrays (V,
+    n) of its vertices. New vertices are projected onto the domain. The other values are interpolated.
     """
     attributes = dict(enumerate((uv, *more)))
     finer, faces, attributes = trimesh.remesh.subdivide(s.astype(float), faces, vertex_attributes=attributes)
@@ -74,10 +79,10 @@ def subdivide(
 def assemble(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
 ) -> Atlas:
-    """Make an atlas: compute normals, tangents and positions of the vertices.
+    """Make an atlas of a mesh with texture coordinates: compute positions, normals and tangents of its vertices.
 
-    `s` (V, 3): domain points. `uv` (V, 2): texture coordinates. `faces` (F, 3). `subdivisions`: level of this mesh.
-    `time`: of the flow.
+    The mesh: domain points `s` (V, 3), texture coordinates `uv` (V, 2), triangles `faces` (F, 3). `subdivisions`: its
+    level. `time`: of the deformation, 0 to 1.
     """
     points, normals, uncut = seamless_surface(ring, s, faces, time)
     # The derivative of the position with respect to u: constant on a triangle, at vertices the mean weighted by area.
@@ -100,7 +105,7 @@ def assemble(
 def seamless_surface(
     ring: FittedObject, s: np.ndarray, faces: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Evaluate the surface at domain points `s` (V, 3) with triangles `faces`, at `time` of the flow.
+    """Evaluate the surface at domain points `s` (V, 3) with triangles `faces`. `time`: of the deformation, 0 to 1.
 
     Returns (points (V, 3) in the normalised frame, normals (V, 3) that are smooth across seams, `Atlas.uncut`).
     """
@@ -113,7 +118,7 @@ def seamless_surface(
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels of a square texture. Texels outside all charts copy the nearest texel inside one."""
+    """The texels of a square texture. A texel outside of all charts copies the nearest texel in a chart."""
 
     s: np.ndarray  # (N, 3) domain points of the N texels in charts
     normals: np.ndarray  # (N, 3) unit normals in the tangent frame of the atlas: along t, the bitangent, n
@@ -121,9 +126,10 @@ class Texels:
 
 
 def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
-    """Compute domain point and normal for each texel of an atlas, at `resolution` × `resolution`.
+    """Compute the domain point and the normal of each texel of an atlas.
 
-    Normals are taken from the mesh at the fit's level, if that is finer.
+    `resolution`: width and height of the texture [texels]. `time`: of the deformation, 0 to 1. Normals come from the
+    mesh at the level of the fit, if it is finer than the atlas.
     """
     bitangents = np.cross(atlas.normals, atlas.tangents[:, :3]) * atlas.tangents[:, 3:]
     s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals
@@ -158,7 +164,7 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
 
 
 def reflectances(ring: FittedObject, s: np.ndarray) -> dict[str, np.ndarray]:
-    """Evaluate BRDF-Net at domain points `s` (N, 3): material parameters by name, each (N, 3) or (N,)."""
+    """Evaluate BRDF-Net at domain points `s` (N, 3). Returns the BSDF parameters (N, 3) or (N,) by name."""
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
         parts = [ring.material(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]

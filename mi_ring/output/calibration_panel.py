@@ -1,4 +1,4 @@
-"""The refined calibration in the report: a table, and charts of before and after."""
+"""The section of the report about refined calibration: a table, and charts of the values before and after the fit."""
 
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ class Panel(NamedTuple):
 
 
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
-    """Make the section from the captures `before` and `after` calibration. `refined`: content of calibration.json."""
+    """Make the section from the capture `before` and `after` the fit. `refined`: content of calibration.json."""
     rows = [row(entry) for entry in refined["unknowns"].values()]
     light = refined.get("light", "capture")
     if light != "capture":
@@ -36,7 +36,10 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
-    """Format an entry of calibration.json as (quantity, value before, value after, standard deviation)."""
+    """Format an unknown as a row of the table: (quantity, value before, value after, standard deviation).
+
+    `entry`: the unknown's entry in calibration.json. If it has many values, the row has their median change.
+    """
     if np.size(entry["after"]) > LISTED:
         several = len(entry["after"]), -1
         moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]).reshape(several), axis=1)
@@ -49,14 +52,17 @@ def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
 
 
 def numbers(value: Any, digits: int) -> str:
-    """Format a number or list of numbers with so many `digits`."""
+    """Format a number, or a list of numbers, with `digits` significant digits."""
     values = np.ravel(value)
     least = 1e-6 * np.abs(values).max()  # below it is rounding
     return ", ".join(f"{0.0 if abs(v) < least else v:.{digits}g}" for v in values)
 
 
 def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Summarise the unknowns that each photograph has by medians over photographs. Returns entries for `row`."""
+    """Summarise the unknowns of single photographs by medians over all photographs. Returns entries for `row`.
+
+    `photographs`: the entry of this name in calibration.json.
+    """
     entries = list(photographs.values())
     result = []
     for key, what in (("turned_degrees", "cameras turned, median [°]"), ("moved", "and moved, median [scene units]")):
@@ -73,9 +79,9 @@ def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any
 
 
 def held_out_text(held_out: dict[str, Any]) -> str:
-    """Write a sentence about the held-out photographs.
+    """Return a sentence for the user about the held-out photographs.
 
-    `held_out`: what `mi_ring.fitting.validation.validate` returned.
+    `held_out`: result of `mi_ring.fitting.validation.validate`; empty if the fit ended early.
     """
     if not held_out:
         return "not tested: the fit ended early"
@@ -90,9 +96,10 @@ def held_out_text(held_out: dict[str, Any]) -> str:
 
 
 def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]]) -> str:
-    """Draw cameras and lights from above, before and after. Returns an SVG data URI.
+    """Draw the charts of the section. Returns an SVG data URI.
 
-    A second plot shows the environment, or the shift or light power of each photograph.
+    The first chart shows cameras and lights from above, before and after the fit. The second chart shows the unknown
+    environment, or the shift of each photograph, or its light power. `photographs`: as for `of_photographs`.
     """
     moved = [entry["moved_px"] for entry in photographs.values()]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
@@ -131,9 +138,9 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
 
 
 def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
-    """Draw cameras, viewing directions and lights, projected to a plane.
+    """Draw cameras, viewing directions and lights into `axes`, projected to a plane.
 
-    `plane` (2, 3): two unit vectors that span it.
+    `plane` (2, 3): two unit vectors that span the plane.
     """
     poses = np.stack([shot.camera.to_world for shot in capture.shots])
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T

@@ -1,4 +1,4 @@
-"""Views to render: the photographs of a scene, or the frames of a film."""
+"""The views that mi-ring render renders: the photographs of a scene, or the frames of a film."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -33,10 +33,11 @@ SLANT = 45.0  #: angle between light and camera in a light orbit, seen from the 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig(MaterialOptions):
-    """Render every photograph of a scene with the object of a finished fit, under the same file names.
+    """Render the object of a finished fit: every photograph of a scene, or a film.
 
-    Or render a film: the camera or the light moves around the object, or the start surface deforms into the object. OUT
-    is then a folder of numbered pictures or an MP4 file.
+    Without --turntable, --light-orbit and --flow the command renders one picture per photograph of SCENE.xml, with the
+    file name of the photograph. With one of these options it renders a film: numbered pictures in a folder, or an MP4
+    file.
     """
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
@@ -47,38 +48,42 @@ class RenderConfig(MaterialOptions):
     """Folder for the pictures, or a file FILE.mp4 for a film.
     A picture is linear if the scene names an EXR file, and 8-bit sRGB if the scene names PNG or JPEG."""
     turntable: int = 0
-    """Number of pictures of a film: camera and light move once around the object. For example 120. 0: no such film."""
+    """Render a film with this number of pictures, for example 120: camera and light move once around the object.
+    0: no such film."""
     light_orbit: int = 0
-    """Number of pictures of a film: the camera stands still, the light moves in a circle around the line of sight.
-    Seen from the object, the angle between light and camera is always 45 degrees. For example 120. 0: no such film."""
+    """Render a film with this number of pictures, for example 120: the light moves in a circle around the line of
+    sight, and the camera stands still. Seen from the object, the angle between light and camera is always 45 degrees.
+    0: no such film."""
     flow: int = 0
-    """Number of pictures of a film: the start surface deforms into the object. For example 60. 0: no such film."""
+    """Render a film with this number of pictures, for example 60: the start surface deforms into the object.
+    0: no such film."""
     view: str | None = None
-    """File name of the photograph whose camera and light --turntable, --light-orbit and --flow use.
-    Without it: the first photograph."""
+    """File name of a photograph: --turntable, --light-orbit and --flow start from its camera and light.
+    Without this option: the first photograph."""
     width: int | None = None
     """Width of the pictures of --turntable, --light-orbit and --flow [px].
-    Without it: the width of the photograph that --view names."""
+    Without this option: the width of the photograph that --view names."""
     up: tuple[float, float, float] | None = None
-    """Direction that points up in the scene, for example 0 0 1: the axis of --turntable and the top of --envmap.
-    Without it: the mean up direction of the cameras."""
+    """Up direction of the scene, for example 0 0 1. It is the axis of --turntable and the direction to the top of
+    --envmap.
+    Without this option: the mean up direction of the cameras."""
     envmap: Path | None = None
     """EXR or HDR file of an environment map (latitude, longitude). It replaces the lights of the photographs.
-    Lamps of the scene file stay on. A `table` shape is left out."""
+    Lamps of the scene file stay on. The command ignores a `table` shape of the scene."""
     integrator: str | None = None
-    """Name of the Mitsuba integrator that computes the light. Without it: photometric, or path with --envmap.
-    photometric is fast and predicts photographs as the fit does. It cannot be used with --envmap.
-    path traces all reflections, also in scenes with other objects. It has more noise and leaves out a `table`."""
+    """Name of the Mitsuba integrator that computes the light. Without this option: photometric, or path with --envmap.
+    photometric is fast and predicts photographs as the fit does. It does not work with --envmap.
+    path traces all reflections, also in scenes with other objects. It has more noise and ignores a `table` shape."""
     format: Literal["png", "exr"] | None = None
     """Format of the pictures. png: 8-bit sRGB. exr: linear radiance.
-    Without it: that of the file names in the scene; png for --turntable, --light-orbit and --flow."""
+    Without this option: that of the file names in the scene; png for --turntable, --light-orbit and --flow."""
     fps: float = 24.0
-    """Pictures per second of an MP4 film, 240 at most. Fewer pictures per second make the film slower."""
+    """Pictures per second of an MP4 film, above 0, at most 240. The film is slower with fewer pictures per second."""
     time: float = 1.0
     """Which state of the deformation to render, 0 to 1. 0: the start surface of the fit. 1: the finished object.
-    0.5: the surface after half of the deformation. It does not go with --flow."""
+    0.5: the surface after half of the deformation. Do not give it together with --flow, which shows all states."""
     subdivisions: int | None = None
-    """Level of the mesh, with about 10 · 4^level vertices. Without it: the level of the fit.
+    """Level of the mesh, with about 10 · 4^level vertices. Without this option: the level of the fit.
     Higher levels show finer detail and take more memory."""
     spp: int = SPP
     """Samples per pixel. More samples give less noise and take longer."""
@@ -105,9 +110,9 @@ class RenderedView:
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
-    """Make the Mitsuba integrator that the options name; None for `photometric`.
+    """Make the Mitsuba integrator that the options name. Returns None for `photometric`.
 
-    Raises InputError for an unknown name.
+    Raises InputError for an unknown name, and for an integrator that does not start at the camera.
     """
     name = config.integrator or ("path" if config.envmap else "photometric")
     if name == "photometric":
@@ -122,7 +127,10 @@ def integrator_of(config: RenderConfig) -> mi.Integrator | None:
 
 
 def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list[RenderedView]:
-    """List the views to render: the photographs of the scene, or the frames of a film."""
+    """List the views to render: the photographs of the scene, or the frames of a film. Renders nothing.
+
+    Raises InputError if --view names no photograph, or if --light-orbit has no light to move.
+    """
     count = config.count
     if not count:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in capture.names]
@@ -164,12 +172,12 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
 
 
 def up_of(capture: Capture, config: RenderConfig) -> np.ndarray:
-    """Return the up direction (3,), unit length: from the options, otherwise from the capture."""
+    """Return the up direction as a unit vector (3,): from --up if it is given, otherwise from the capture."""
     return capture.up if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
 
 
 def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """Rotate and zoom a camera, without moving it, so that object and start surface fill the picture.
+    """Rotate and zoom a camera so that object and start surface fill the picture. The camera keeps its position.
 
     Returns (new camera, centre (3,) of the object [scene units]). `up` (3,): up direction.
     """
@@ -191,7 +199,11 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
 
 
 def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
-    """Return the object in the scene; with --envmap under that environment and the scene's lamps, without a table."""
+    """Make the surface that is rendered: the object in the scene.
+
+    With --envmap, the environment map replaces the lights of the photographs, and tables are left out. Raises
+    InputError if the file of the environment map cannot be read.
+    """
     if not config.envmap:
         return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
     to_world = np.eye(4)
@@ -212,7 +224,10 @@ def render_views(
     surface: Surface, ring: FittedObject, views: list[RenderedView], integrator: mi.Integrator | None,
     capture: Capture, config: RenderConfig,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """Render the views one by one: pictures (H, W, 3) of linear radiance."""
+    """Render the views one by one. Yields pictures (H, W, 3) of linear radiance.
+
+    `integrator`: from `integrator_of`; None: photometric.
+    """
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
     for k, view in enumerate(progress(views, "rendering", unit="picture", leave=True)):
@@ -229,9 +244,10 @@ def render_views(
 
 
 def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """Render a picture (H, W, 3) with a Mitsuba integrator in several passes, and average these.
+    """Render a picture (H, W, 3) with a Mitsuba integrator in several passes, and return their average.
 
-    So memory does not grow with `spp`. A pass has at most `LANES` rays, but at least one per pixel.
+    With several passes, the memory does not grow with `spp`. A pass has at most `LANES` rays, but at least one per
+    pixel.
     """
     width, height = sensor.camera.size
     at_once = min(spp, max(1, LANES // (width * height)))

@@ -1,4 +1,4 @@
-"""The contact sheet of a capture: a plan of cameras and lights, and the photographs with masks and hull."""
+"""Draws the contact sheet of a capture: a plan of cameras and lights, and the photographs with masks and hull."""
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -25,7 +25,10 @@ LEGEND = (
 
 
 def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
-    """Draw cameras, viewing directions, lights and the normalising sphere, projected along the three axes."""
+    """Draw cameras, viewing directions, lights and the normalising sphere, projected along each of the three axes.
+
+    `center` (3,), `radius`: normalising sphere [scene units].
+    """
     cameras, lights = np.stack([shot.camera.to_world for shot in capture.shots]), capture.photographs.lights
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
     away = np.where(lights.is_finite()[:, None], lights.positions(), center + reach * lights.positions())

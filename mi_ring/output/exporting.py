@@ -1,4 +1,4 @@
-"""Writes a fitted object as a file of another program."""
+"""Writes a fitted object as a file for other programs."""
 
 import math
 from collections.abc import Sequence
@@ -30,10 +30,11 @@ def export(
 ) -> list[Path]:  # fmt: skip
     """Write a fitted object as PLY, OBJ, GLB or Mitsuba XML, by the suffix of `file`. Returns all files written.
 
-    `subdivisions`: level of the mesh, about 10 · 4^level vertices; default: that of the fit, at most 5 for GLB.
-    `resolution`: width of the textures [px]. `time`: of the flow, in [0, 1]. `metres`: length of a scene unit [m], only
-    for GLB; default: that of the object. `views`: cameras of the photographs; PLY and GLB then mark the vertices that
-    they show. `photograph`: camera and light of an XML scene, and the light of its room (BASIS, 3).
+    `subdivisions`: level of the mesh, about 10 · 4^level vertices; default: the level of the fit, at most 5 for GLB.
+    `resolution`: width of the textures [px]. `time`: of the deformation, 0 to 1. `metres`: length of a scene unit [m],
+    only for GLB; default: the length that the object knows. `views`: cameras of the photographs; if they are given, PLY
+    and GLB mark the vertices that a photograph shows. `photograph`: for XML, (photograph whose camera and light the
+    scene gets, room light (BASIS, 3) or None).
 
     Raises InputError for values out of range, for a BSDF that glTF cannot express, and if a file cannot be written.
     """
@@ -66,7 +67,7 @@ def require_exportable(
 ) -> str:  # fmt: skip
     """Check the arguments of `export`. Returns the suffix of `file`, one of `KINDS`.
 
-    Raises InputError if one is invalid.
+    Raises InputError if an argument is invalid.
     """
     kind = file.suffix.lower()
     if kind not in KINDS:

@@ -1,4 +1,4 @@
-"""The data that the files of a fit are written from."""
+"""The data from which the files of a fit are written."""
 
 import functools
 from collections.abc import Callable, Collection, Sequence
@@ -15,7 +15,10 @@ from mi_ring.scene.lights import Light
 
 @dataclass(frozen=True)
 class FitResult:
-    """The state of a fit from which result files are written. It is no copy: use it before the fit continues."""
+    """The data from which the results of a fit are written.
+
+    It shares its parts with the fit, so write the results before the fit continues.
+    """
 
     ring: FittedObject
     surface: Surface  #: of the ring, to draw it
@@ -41,10 +44,13 @@ class FitResult:
 
     @functools.cached_property
     def calibration(self) -> dict[str, Any] | None:
-        """Make the content of calibration.json; None if nothing was refined. It renders, so write other files first."""
+        """The content of calibration.json; None if nothing was refined.
+
+        The first access renders photographs, which takes time. So write other files before.
+        """
         return self.summary and self.summary()
 
     def drawn(self, level: int) -> Surface:
-        """Return the surface at this level of the mesh, ready for rendering."""
+        """Evaluate the surface at mesh level `level`, and return it ready for rendering."""
         self.surface.show(self.ring, *self.ring.domain.sample(level))
         return self.surface

@@ -1,4 +1,4 @@
-"""glTF: a fitted object with metallic-roughness textures, as one GLB file."""
+"""Makes glTF: a fitted object with metallic-roughness textures, as one GLB file."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -24,7 +24,7 @@ LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatne
 
 
 class Material(NamedTuple):
-    """The material of N points as parameters of glTF; all are linear."""
+    """The material of N points as parameters of glTF. All values are linear."""
 
     base_color: np.ndarray  # (N, 3), in [0, 1]
     metallic: np.ndarray  # (N,)
@@ -35,16 +35,18 @@ class Material(NamedTuple):
 
 
 def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
-    """Convert a BSDF (Mitsuba's XML) and its `values` by name, (N, 3) or (N,), to glTF's metallic-roughness material.
+    """Convert a BSDF with its values at N points to glTF's metallic-roughness material.
+
+    `bsdf`: Mitsuba's XML. `values`: parameters of the BSDF by name, (N, 3) or (N,).
 
     ``cooktorrance``: glTF's dielectric is (1 − F) c/π + F D V with Schlick's F between F₀ = min(0.04 k, 1) w and
-    F₉₀ = w, where w is `specular` and k `specular_color`. With k = 25, F is w at all angles, and
+    F₉₀ = w, where w is `specular` and k is `specular_color`. With k = 25, F is w at all angles, and
 
         w = 4 ρᵞ,  c = π ρᵈ / (1 − w),  roughness = √r
 
-    give ρᵈ + 4 ρᵞ D V with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: our G is Smith's product, glTF's G is
-    height-correlated. c ≤ 1 and w ≤ 1 hold if the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1. If more than 1 % of the
-    points do not conserve energy, the lights' intensities were wrong, and all ρ are scaled.
+    give ρᵈ + 4 ρᵞ D V with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: G is Smith's product in ``cooktorrance``
+    and height-correlated in glTF. If the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1, then c ≤ 1 and w ≤ 1. If more than
+    1 % of the points do not conserve energy, the intensities of the lights were wrong. Then all ρ are scaled.
 
     ``diffuse`` is exact in glTF. ``principled`` without other lobes is nearly exact. Raises InputError for other BSDFs.
     """
@@ -81,12 +83,15 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
 
 def require_expressible(ring: FittedObject) -> None:
-    """Raise InputError if glTF cannot express the material of an object. Call it before the slow baking."""
+    """Raise InputError if glTF cannot express the material of an object. It is quick; call it before `glb`."""
     metallic_roughness(ring.bsdf, reflectances(ring, ring.domain.sample(2)[0].numpy()))
 
 
 def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
-    """Convert a material at the texels to textures, (H, W, 3 or 4) uint8, by their glTF names."""
+    """Convert a material to textures. Returns arrays (H, W, 3 or 4) uint8 by their glTF names.
+
+    `material`: the material at the N points of `texels`.
+    """
     ones = np.ones_like(material.roughness)
     images = {
         "baseColorTexture": linear_to_srgb(material.base_color),
@@ -101,11 +106,14 @@ def glb(
     ring: FittedObject, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
     views: Sequence[MaskedCamera] | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """Make a GLB file of an object, with textures of `resolution` texels a side.
+    """Make a GLB file of an object. Returns its bytes.
 
-    Positions are in scene units and in the scene's frame. A node scales them to metres if `metres`, the length of a
-    scene unit, is given, and turns `up` (3,) to the y axis. The BSDF's own parameters are vertex attributes (_DIFFUSE,
-    …), which the material's extras describe. With `views`, _SEEN is 1 where a view shows the object, and 0 elsewhere.
+    `subdivisions`: level of the mesh. `resolution`: width and height of the textures [texels]. `time`: of the
+    deformation, 0 to 1. Positions are in scene units and in the scene's frame. `metres`: length of a scene unit [m]; a
+    node scales the positions to metres. `up` (3,): up direction; the node turns it to the y axis. The parameters of the
+    BSDF are vertex attributes (_DIFFUSE, …); the extras of the material describe them. `views`: if they are given, the
+    vertex attribute _SEEN is 1 for vertices that a view shows, otherwise 0. Raises InputError if glTF cannot express
+    the material.
     """
     require_expressible(ring)
     atlas = unwrap(ring, subdivisions, resolution, time)
@@ -123,9 +131,10 @@ def assemble_glb(
     atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
     metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """Make a GLB file from a mesh, `textures`, and the BSDF's parameters at the vertices (`exact`, by name).
+    """Make a GLB file from a mesh and its textures. Returns its bytes.
 
-    `seen` (V,) bool: vertices that a photograph shows. Other arguments: as for `glb`.
+    `atlas`: the mesh with V vertices. `images`: result of `textures`. `exact`: parameters of the BSDF at the vertices,
+    by name. `bsdf`: Mitsuba's XML. `seen` (V,) bool: vertices that a photograph shows. Other arguments: as for `glb`.
     """
     blob = bytearray()
     buffer_views: list[pygltflib.BufferView] = []

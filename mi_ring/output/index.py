@@ -1,4 +1,4 @@
-"""index.html: a page that lists many fits, with a picture and numbers from each report."""
+"""Writes index.html: a page that lists many fits, with a picture and numbers from each report."""
 
 import base64
 import contextlib
@@ -43,7 +43,7 @@ class Entry(NamedTuple):
 
 
 def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
-    """Write the page of all fits. While fits are `running`, browsers reload it from time to time."""
+    """Write index.html into the folder `out`. `running`: fits are running, so browsers reload the page regularly."""
     template = resources.files("mi_ring.output").joinpath("index.html.jinja").read_text("utf-8")
     rows = [row_of(entry, out) for entry in entries]
     states = [entry.state for entry in entries]
@@ -56,7 +56,7 @@ def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
 
 
 def row_of(entry: Entry, out: Path) -> dict:
-    """Collect what the page shows in the row of a fit."""
+    """Collect the values that the page shows in the row of a fit, by name, for the template."""
     figures: dict[str, str] = {}
     picture, report = None, entry.folder / "report.html"
     with contextlib.suppress(OSError, ValueError):
@@ -69,15 +69,15 @@ def row_of(entry: Entry, out: Path) -> dict:
 
 
 def link_to(file: Path, out: Path) -> str | None:
-    """Make a link to `file` for a page in the folder `out`; None if there is no such file."""
+    """Return a link to `file` for a page in the folder `out`; None if there is no such file."""
     return quote(relative_to(out.resolve(), file.resolve())) if file.is_file() else None
 
 
 @functools.lru_cache(maxsize=4096)
 def report_summary(report: Path, modified: int) -> tuple[dict[str, str], str | None]:
-    """Read a report. Returns (its numbers by name, thumbnail of the first photograph's prediction as data URI or None).
+    """Read a report. Returns (its numbers by name, thumbnail of the first predicted photograph, a data URI or None).
 
-    `modified`: modification time of the file. The result is cached by it, because the page is often rewritten.
+    `modified`: modification time of the file. It serves as a key of the cache: the page is rewritten often.
     """
     page = report.read_text("utf-8")
     cells = re.findall(r"<tr><th>([^<]*)</th><td>([^<]*)</td></tr>", page)

@@ -18,27 +18,27 @@ from mi_ring.system.progress import progress
 
 @dataclass(frozen=True)
 class Inspection:
-    """The result of `inspect`."""
+    """The result of `inspect`: a text, the problems and the contact sheet."""
 
     text: str  #: the table of photographs and the findings
     findings: list[str]  #: the problems to correct
     page: Image.Image  #: the contact sheet
 
     def save(self, path: Path, field: str) -> None:
-        """Write the contact sheet as PNG. Raises InputError, which names the `field`, if this fails."""
+        """Write the contact sheet as a PNG file. Raises InputError, which names the `field`, if that fails."""
         with writing(f"{path}: {field}"):
             path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, encoded_picture(self.page))
 
 
 def inspect(capture: Capture) -> Inspection:
-    """Check a capture before a fit. Empty masks are reported, then ignored."""
+    """Check a capture before a fit. It reports empty masks and then ignores them. Writes no file."""
     with progress(None, "inspecting", 4) as bar:
         return inspected(capture, bar.update)
 
 
 def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
-    """Like `inspect`, and call `advance` after each of the four steps."""
+    """Do the same as `inspect`, and call `advance` after each of the four steps."""
     capture, empty = without_empty_masks(capture)
     found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in empty]
     try:

@@ -1,4 +1,4 @@
-"""A scene for Mitsuba without mi_ring: textures and stock plugins only."""
+"""Writes a scene that Mitsuba renders without mi_ring: it has only textures and Mitsuba's own plugins."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -38,9 +38,10 @@ def write_scene(
     path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], shot: Shot,
     room: np.ndarray | None,
 ) -> list[Path]:  # fmt: skip
-    """Write a scene with the textured object and a photograph's camera and light; returns the paths of its files.
+    """Write a scene with the textured object and the camera and light of a photograph. Returns the paths of its files.
 
-    If the photograph has no light, the scene has the light of the `room` (BASIS, 3).
+    `values`: parameters of the BSDF at the N texels, by name. `bsdf`: Mitsuba's XML. `shot`: the photograph. `room`
+    (BASIS, 3): room light; the scene gets it if the photograph has no light.
     """
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
@@ -51,7 +52,7 @@ def write_scene(
     write_ply(mesh, files[-1])
 
     def bitmap(parent: ElementTree.Element, name: str, image: np.ndarray) -> None:
-        """Add a texture with values (N, 3) or (N,) at the texels."""
+        """Write a texture with values (N, 3) or (N,) at the texels, and add its XML to `parent`."""
         files.append(path.with_name(f"{path.stem}_{name}.exr"))
         write_image(image[texels.index].astype(np.float32).reshape(*texels.index.shape, -1), files[-1])
         texture = ElementTree.SubElement(parent, "texture", name=name, type="bitmap")

@@ -1,4 +1,4 @@
-"""Textured meshes as OBJ with MTL and PNG."""
+"""Writes textured meshes as OBJ, MTL and PNG files."""
 
 import io
 from pathlib import Path
@@ -14,7 +14,8 @@ from mi_ring.system.files import write_file
 def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material) -> list[Path]:
     """Write OBJ, MTL and PNG files. Returns their paths.
 
-    Only texture coordinates, not vertices, are duplicated at seams.
+    `path`: the OBJ file. `material`: the material at the texels. Along seams, texture coordinates are duplicated, but
+    vertices are not.
     """
     baked, files = gltf.textures(material, texels), {}
     for name, image in {

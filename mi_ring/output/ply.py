@@ -1,4 +1,4 @@
-"""Meshes as PLY, with the material at each vertex."""
+"""Writes meshes as PLY files, with the material of each vertex."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +15,11 @@ from mi_ring.system.files import write_file
 def write_mesh(
     ring: FittedObject, subdivisions: int, path: Path, time: float = 1.0, views: Sequence[MaskedCamera] | None = None
 ) -> float | None:
-    """Write the surface as PLY in scene units, with the BSDF's parameters as vertex attributes (vertex_diffuse, …).
+    """Write the surface as a PLY file in scene units. Vertex attributes are the BSDF parameters (vertex_diffuse, …).
 
-    With `views`, the attribute vertex_seen is 1 where a view shows the object, and the share of the area that no view
-    shows is returned; otherwise None.
+    `subdivisions`: level of the mesh. `time`: of the deformation, 0 to 1. `views`: if they are given, the attribute
+    vertex_seen is 1 for vertices that a view shows, otherwise 0. Returns the share of the area that no view shows; None
+    without `views`.
     """
     s, faces = ring.domain.sample(subdivisions)
     with torch.no_grad():
@@ -36,7 +37,7 @@ def write_mesh(
 
 
 def write_ply(mesh: mi.Mesh, path: Path) -> None:
-    """Write a mesh as PLY, by `write_file`."""
+    """Write a mesh as a PLY file. Raises InputError if the file cannot be written."""
     stream = mi.MemoryStream()
     mesh.write_ply(stream)
     write_file(path, stream.raw_buffer())

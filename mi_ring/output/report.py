@@ -1,4 +1,4 @@
-"""report.html: a self-contained page that shows the quality of a fit."""
+"""Makes report.html: a self-contained page that shows the quality of a fit."""
 
 import base64
 import math
@@ -59,9 +59,10 @@ class PhotographPanel:
 
 
 def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
-    """Make the report of a fit as HTML. `glb`: the object, for the viewer.
+    """Make the report of a fit. Renders photographs. Returns HTML.
 
-    `unseen`: share of area that no photograph shows.
+    `glb`: the bytes of a GLB file, for the viewer; None: no viewer. `unseen`: share of the surface area that no
+    photograph shows.
     """
     capture, ring, refined = result.capture, result.ring, result.calibration
     surface = result.drawn(ring.subdivisions)
@@ -107,7 +108,10 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
 
 
 def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
-    """Choose the viewer's start: `up`, `eye` and the `irradiance` (RGB) at the object's centre, in scene units."""
+    """Choose what the viewer shows first. Returns `up` direction, `eye` position and `irradiance` (RGB), by name.
+
+    The irradiance is that at the centre of the object. All are in scene units.
+    """
     eye = capture.shots[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
     if not irradiance.any():  # photographs have no lights of their own
@@ -119,9 +123,10 @@ def fit_findings(
     rows: Sequence[PhotographPanel], iteration: int, iterations: int, refined: dict[str, Any] | None = None,
     unexplained: float = 0.0,
 ) -> list[str]:  # fmt: skip
-    """List problems of a fit as sentences, each with advice.
+    """List problems of a fit as sentences for the user. Each sentence contains advice.
 
-    `refined`: content of calibration.json. `unexplained`: share of the object's light that the fit does not predict.
+    `rows`: the fitted photographs. `iteration`: number of iterations that are done, of `iterations`. `refined`: content
+    of calibration.json. `unexplained`: share of the object's light that the fit does not predict.
     """
     found = []
     if iteration == iterations >= FEW_ITERATIONS and unexplained > UNEXPLAINED:
@@ -166,22 +171,26 @@ def fit_findings(
 
 
 def middle(values: Sequence[float] | Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Median of values (n, ...) over n.
+    """Compute (median, robust standard deviation) of values (n, ...) over n.
 
-    Returns (median, robust standard deviation from the median absolute deviation).
+    The standard deviation is estimated by the median absolute deviation.
     """
     median = np.median(values, axis=0)
     return median, 1.4826 * np.median(np.abs(np.subtract(values, median)), axis=0)
 
 
 def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
-    """List the lowest of tuples (rank, name, number) in one line, at most `most`; empty if there are none."""
+    """Return a line for the user that lists the photographs with the lowest ranks; empty if there are none.
+
+    `photographs`: tuples (rank, name, number as text). `most`: number of photographs that are listed; the line counts
+    the others.
+    """
     ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
     return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
 
 
 def sides(x: float, y: float) -> str:
-    """Describe a shift of `x`, `y` [px] in words: how far right or left, up or down."""
+    """Describe a shift in words. `x`: to the right [px]. `y`: downward [px]."""
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
@@ -194,12 +203,15 @@ class PredictedPhotograph(NamedTuple):
 
 
 def scale_of(result: FitResult, size: tuple[int, int]) -> int:
-    """Factor by which photographs of this size are reduced before comparison, as in the last stage of the fit."""
+    """Return the factor by which photographs of this size are reduced before they are compared.
+
+    It is that of the last stage of the fit. `size`: (width, height) [px].
+    """
     return -(-size[0] // result.width)
 
 
 def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[PredictedPhotograph]:
-    """Predict photographs `index`, all of one size."""
+    """Render the predictions of photographs `index`, all of one size."""
     capture, ring = result.capture, result.ring
     size = capture.shots[index[0]].size
     scale = scale_of(result, size)
@@ -217,7 +229,7 @@ def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Pr
 def panels_of(
     result: FitResult, index: np.ndarray, predictions: Sequence[PredictedPhotograph]
 ) -> list[tuple[PhotographPanel, float]]:
-    """Call `panel_of` for the photographs `index`, and list the results."""
+    """Call `panel_of` for each of the photographs `index`. Returns the list of results."""
     return [panel_of(result, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
@@ -265,9 +277,9 @@ def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tupl
 
 
 def shift(photo: np.ndarray, guess: np.ndarray, inside: np.ndarray) -> tuple[float, float] | None:
-    """Estimate the translation (right, down) [px] from `guess` to `photo`, both (H, W, 3), inside a mask (H, W).
+    """Estimate the translation (right, down) [px] from the picture `guess` to the picture `photo`, both (H, W, 3).
 
-    None if the pictures are black there.
+    `inside` (H, W) bool: the region that is compared. Returns None if it is empty, or if a picture is black.
     """
     if not (photo.any() and guess.any() and inside.any()):
         return None

@@ -32,7 +32,10 @@ VIEWED, TEXELS = 5, 1024  #: finest level of the object in the report's viewer, 
 
 
 def default_folder(scene: Path) -> Path:
-    """The default results folder of a scene, out/NAME. Raises InputError if it has results of another scene."""
+    """Return the default results folder of a scene file, out/NAME.
+
+    Raises InputError if the folder contains the results of another scene.
+    """
     folder, other = Path("out") / scene_name(scene), None
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # config.json is missing or damaged
         other = folder / read_json(folder / "config.json")["scene"]
@@ -43,10 +46,11 @@ def default_folder(scene: Path) -> Path:
 
 
 def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """Make the results folder and write config.json: the options, and the path of the scene relative to the folder.
+    """Make the results folder and write config.json into it.
 
-    Without `resume`, a folder with other results is renamed, not overwritten. Raises InputError if the folder cannot be
-    written or contains the scene file.
+    `scene`: the scene file. config.json contains `options` and the path of the scene file relative to the folder. If
+    the folder contains earlier results, it is renamed, unless `resume` is true. Raises InputError if the folder cannot
+    be written or contains the scene file.
     """
     if folder.resolve() in scene.resolve().parents:
         raise InputError(f"{folder.resolve()}: --out: holds the scene file {scene.name} itself; choose another folder")
@@ -54,7 +58,7 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
 
 
 def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """Like `prepare_folder`, but the folder may contain the scene file."""
+    """Do the same as `prepare_folder`, but allow a folder that contains the scene file."""
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
@@ -66,16 +70,17 @@ def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) 
 
 
 def move_aside(folder: Path) -> None:
-    """Rename an existing folder, so that its name becomes free."""
+    """Rename an existing folder to NAME.1, NAME.2, …, and tell the user."""
     aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
     folder.rename(aside)
     print(f"The results that were in {folder}/ are now in {aside}/")
 
 
 def save(folder: Path, result: FitResult) -> None:
-    """Write all results of a fit into a folder. A folder with earlier results is renamed first.
+    """Write all results of a fit into a folder. If the folder contains earlier results, it is renamed first.
 
-    A capture from arrays is written too, as capture/scene.xml in the folder.
+    If the capture was made from arrays, it is written too, as capture/scene.xml in the folder. Raises InputError if a
+    file cannot be written, ValueError if a network is not registered.
     """
     capture = result.given
     ring_state(result.ring)  # raises for networks without a name before anything is moved
@@ -92,7 +97,7 @@ def save(folder: Path, result: FitResult) -> None:
 
 
 def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
-    """Make the content of scene.xml for a fit, without its calibration.
+    """Make the content of scene.xml for the results in `folder`, with the given calibration. Writes no file.
 
     Raises InputError if the scene cannot be rewritten.
     """
@@ -100,19 +105,19 @@ def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
 
 
 def write_log(folder: Path, entries: Iterable[dict]) -> None:
-    """Write all `entries` to log.jsonl in `folder`."""
+    """Write log.jsonl into `folder`, with these entries only."""
     write_file(folder / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries))
 
 
 def add_to_log(folder: Path, entry: dict) -> None:
-    """Append an entry to log.jsonl."""
+    """Append an entry to log.jsonl in `folder`. Raises InputError if that fails."""
     path = folder / "log.jsonl"
     with writing(path), path.open("a") as file:
         file.write(json.dumps(entry) + "\n")
 
 
 def read_log(folder: Path) -> list[dict]:
-    """Read the entries of log.jsonl. An incomplete last line, after a kill or a full disk, is left out."""
+    """Read the entries of log.jsonl in `folder`. Incomplete lines, as after a full disk, are left out."""
     entries = []
     for line in (folder / "log.jsonl").read_bytes().splitlines():
         with contextlib.suppress(ValueError, RecursionError):
@@ -121,7 +126,7 @@ def read_log(folder: Path) -> list[dict]:
 
 
 def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
-    """Write inputs.png: photographs with the start surface in green. It makes wrong masks and poses visible."""
+    """Write inputs.png to `path`: photographs with the start surface in green. It shows wrong masks and poses."""
     some = capture.spread()
     columns = min(10, len(some))
     cell, line = 160, 16
@@ -143,7 +148,7 @@ def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
 def write(folder: Path, result: FitResult, scene: bytes) -> None:
     """Write ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, finished or not.
 
-    `scene`: what `fitted_scene` returned, with cameras and lights as before the fit.
+    `folder`: an existing results folder. `scene`: result of `fitted_scene`; this function adds the calibration.
     """
     ring, capture = result.ring, result.capture
     write_state(ring_state(ring, result.settings), folder / "ring.pt")
@@ -171,9 +176,9 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
 
 
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
-    """Write the masks of photographs `index` as PNG. Each has its photograph's name with .png added.
+    """Write the masks of photographs `index` as PNG files into `folder`: NAME.png for the photograph NAME.
 
-    Returns file names by index, relative to a scene file beside `folder`.
+    Returns the file names by index. They are relative to the parent of `folder`.
     """
     names = {}
     for k in index:
@@ -188,7 +193,7 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
 
 
 def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> bytes | None:
-    """Make the GLB for the viewer in the report. If that fails, prints why and returns None."""
+    """Make the GLB file for the viewer in the report. Returns its bytes. If that fails, prints why and returns None."""
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)

@@ -1,4 +1,4 @@
-"""Matplotlib figures for web pages."""
+"""Encodes Matplotlib figures for web pages."""
 
 import base64
 import io

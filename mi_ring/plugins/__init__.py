@@ -11,7 +11,7 @@ PLUGINS = ("photograph", "flash", "room", "cooktorrance", "merl", "shapenet", "t
 
 
 def register() -> None:
-    """Define the plugins for the current variant of Mitsuba. Each variant needs its own classes."""
+    """Define and register the plugins for the current variant of Mitsuba. Each variant needs its own classes."""
     for name in PLUGINS:
         module = f"{__name__}.{name}"
         if module in sys.modules:

@@ -55,7 +55,7 @@ class CookTorrance(mi.BSDF):
 
     What it does not do: transmission, two-sided surfaces, anisotropy, light between microfacets.
 
-    Raises ValueError if ``distribution`` is neither of the two.
+    Raises ValueError if ``distribution`` is neither ``ggx`` nor ``beckmann``, or if ``fresnel`` is no boolean.
 
     .. tab-set-code::
 
@@ -97,29 +97,35 @@ class CookTorrance(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def parameters(self, si, active=True):
-        """Evaluate the parameters at surface interactions: (ρᵈ, ρᵞ, r)."""
+        """Evaluate the three parameters (ρᵈ, ρᵞ, r) at the surface interactions `si`. r is clamped to at least 0.02."""
         diffuse = self.textures["diffuse"].eval(si, active)
         specular = self.textures["specular"].eval_1(si, active)
         return diffuse, specular, dr.maximum(self.textures["roughness"].eval_1(si, active), MIN_ROUGHNESS)
 
     @staticmethod
     def front(si, wo):
-        """Test whether viewer and `wo` are on the front side, by the shading normal or by the geometric normal."""
+        """Test whether viewer and `wo` are on the front side of the surface.
+
+        For the viewer, it is enough to be on the front side of the shading normal or of the geometric normal.
+        """
         n = si.to_local(si.n)
         return ((si.wi.z > 0) | (dr.dot(si.wi, n) > 0)) & (wo.z > 0)
 
     def microfacets(self, r):
-        """Make Mitsuba's microfacet distribution for roughness `r`: D / π and G of equation 1, and visible normals."""
+        """Make Mitsuba's microfacet distribution for roughness `r`. It evaluates D / π and G and samples normals."""
         return mi.MicrofacetDistribution(DISTRIBUTIONS[self.distribution], r, True)
 
     def with_fresnel(self, specular, cosine):
-        """Apply the Fresnel term to ρᵞ (`specular`). `cosine`: o·h."""
+        """Return ρᵞ (`specular`) with the Fresnel term applied; without ``fresnel``, unchanged. `cosine`: o·h."""
         if not self.fresnel:
             return specular
         return specular + dr.maximum(0.25 - specular, 0) * dr.power(1 - dr.clip(cosine, 0, 1), 5)
 
     def reflected(self, ctx, si, wo, diffuse, specular, r, active):
-        """Evaluate equation 1 times the cosine, B (n·i) [1/sr]."""
+        """Evaluate B (n·i) [1/sr], equation 1 times the cosine, for light from direction `wo`.
+
+        `diffuse`, `specular`, `r`: the `parameters` at `si`.
+        """
         o, i = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (si.wi, wo))
         h = dr.normalize(wo + si.wi)
         h.z = dr.abs(h.z)  # at the contour h may be below the surface, where Mitsuba's D is 0
@@ -131,11 +137,12 @@ class CookTorrance(mi.BSDF):
         return dr.select(active & self.front(si, wo), value * i.z, 0)
 
     def lobes(self, si, order, active=True):
-        """Reflection of slowly varying light. Returns for each lobe (its world direction, its factors).
+        """Compute how the BSDF reflects light that is given by spherical harmonics: as a list of two lobes.
 
-        The `order` + 1 factors are for the degrees of spherical harmonics about this direction. The diffuse lobe is
-        that of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The
-        specular lobe is approximated as symmetric about its mean direction, by `gloss_table`.
+        A lobe is symmetric about a direction. It is returned as (its direction in the world, `order` + 1 factors): the
+        factors of the degrees 0 to `order` of the harmonics about this direction. The diffuse lobe is that of "An
+        Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The specular lobe is
+        approximated by `gloss_table`.
         """
         diffuse, specular, r = self.parameters(si, active)
         active &= self.front(si, mi.Vector3f(0, 0, 1))
@@ -151,9 +158,10 @@ class CookTorrance(mi.BSDF):
         ]
 
     def gloss_probability(self, ctx, si, diffuse, specular):
-        """Probability of sampling the specular lobe, proportional to the bounds of the two albedos, π ρᵈ and 4 ρᵞ.
+        """Compute the probability with which `sample` chooses the specular lobe: 4 ρᵞ / (π ρᵈ + 4 ρᵞ).
 
-        Detached, because the choice of a lobe is not differentiated with respect to the parameters either.
+        π ρᵈ and 4 ρᵞ are upper bounds of the albedos of both lobes. The result has no gradients: the choice of a lobe
+        is not differentiated.
         """
         has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         has_gloss = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
@@ -166,7 +174,10 @@ class CookTorrance(mi.BSDF):
         return dr.select(d + s > 0, s / (d + s), 0.5)
 
     def density(self, si, wo, r, gloss, active):
-        """Density [1/sr] of the directions that `sample` draws, from the cosine lobe or by visible normals."""
+        """Compute the probability density [1/sr] with which `sample` draws the direction `wo`.
+
+        `gloss`: probability of the specular lobe.
+        """
         facets = self.microfacets(r)
         h = dr.normalize(wo + si.wi)
         # The density of visible normals is D G₁ (o·h) / (n·o), the Jacobian of the reflection 1 / (4 (o·h)).
@@ -213,7 +224,10 @@ class CookTorrance(mi.BSDF):
 
 
 def cosine_factors(order):
-    """Factors by which a surface of B = 1 multiplies spherical harmonics of degree 0 to `order`."""
+    """Compute factors by which a diffuse surface with ρᵈ = 1 multiplies spherical harmonics of degrees 0 to `order`.
+
+    Returns a list of `order` + 1 numbers.
+    """
     factors = [math.pi, 2 * math.pi / 3]
     for degree in range(2, order + 1):
         half = degree // 2
@@ -225,12 +239,13 @@ def cosine_factors(order):
 
 @functools.lru_cache(maxsize=8)
 def gloss_table(variant, distribution, order):
-    """Tabulate the specular lobe for a specular reflectance of 1: a texture over roughness and n·o.
+    """Tabulate the specular lobe for a specular reflectance of 1. Returns a texture over roughness and n·o.
 
-    Roughness is 0.02 to 1, n·o 0 to 1: n is the normal, o the direction to the viewer. Channels 0 and 1 give the mean
-    direction of the lobe. 0: its component along the surface, opposite to o, divided by that of o. 1: its component
-    along n. Channel 2 + l: the integral of the lobe times the Legendre polynomial of degree l about the mean direction.
-    The integrals are averages over a grid of visible normals, as in `CookTorrance.sample`.
+    The roughness goes from 0.02 to 1, n·o from 0 to 1. n is the normal, o the direction to the viewer. The channels 0
+    and 1 describe the mean direction of the lobe. Channel 0 is the component of this direction along the surface,
+    opposite to o, divided by the component of o along the surface. Channel 1 is its component along n. Channel 2 + l is
+    the integral of the lobe times the Legendre polynomial of degree l about the mean direction. The integrals are
+    averages over a grid of visible normals, as in `CookTorrance.sample`.
     """
     with dr.suspend_grad():
         count = GLOSS_SAMPLES**2
@@ -262,7 +277,7 @@ def gloss_table(variant, distribution, order):
 
 
 def legendre(x, order):
-    """Evaluate the Legendre polynomials of degree 0 to `order` at x, by Bonnet's recursion."""
+    """Evaluate the Legendre polynomials of degrees 0 to `order` at x, by Bonnet's recursion. Returns a list."""
     found = [mi.Float(1), x]
     for n in range(1, order):
         found.append(((2 * n + 1) * x * found[n] - n * found[n - 1]) / (n + 1))

@@ -1,4 +1,4 @@
-"""The `flash` emitter: it shows a photograph's light to stock integrators (Mitsuba plugin)."""
+"""The `flash` emitter: it gives a photograph's own light to Mitsuba's integrators (Mitsuba plugin)."""
 
 import drjit as dr
 import mitsuba as mi
@@ -8,9 +8,10 @@ from mi_ring.rendering.photograph_lights import DISTANT, flash_falloff
 
 
 def flash_light(it, sample=(0, 0), active=True):
-    """Sample the light of the photograph being rendered, at interactions `it`: (DirectionSample3f, radiance · d⁻²).
+    """Sample the light of the photograph that is being rendered, at the interactions `it`.
 
-    It is black while another kind of sensor is rendered.
+    Returns (DirectionSample3f, radiance · d⁻²), as `mi.Emitter.sample_direction`. The radiance is 0 while a sensor of
+    another kind is rendered.
     """
     if Photograph.current is None:
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
@@ -45,13 +46,13 @@ class InvisibleEmitter(mi.Emitter):
 
 
 class Flash(InvisibleEmitter):
-    """The light of whichever `photograph` is rendered; black while another kind of sensor is rendered.
+    """Gives the light of the `photograph` that is being rendered to the scene. Other sensors see it black.
 
-    A nested emitter lights only its own photograph. It is not an emitter of the scene, so stock integrators do not see
-    it. For them `shapenet` carries this emitter, which passes every call on to the light of the current photograph. It
-    has no parameters.
+    The emitter nested in a `photograph` lights only this photograph. It is not an emitter of the scene, so Mitsuba's
+    own integrators do not find it. `flash` is an emitter of the scene. It passes every call on to the light of the
+    current photograph. It has no parameters. Each `shapenet` shape contains a `flash`.
 
-    You need it yourself only in a scene of `photograph` sensors without a `shapenet` shape:
+    You need to write it only in a scene of `photograph` sensors without a `shapenet` shape:
 
     .. tab-set-code::
 

@@ -22,18 +22,17 @@ class Merl(mi.BSDF):
     ``material`` string    name of the network to use; not with a table
     ============ ========= =====================================================================
 
-    Values are those of the file, in the coordinates of Rusinkiewicz 1998 (A New Change of Variables for Efficient BRDF
-    Representation).
+    The angles are θh and θd of Rusinkiewicz 1998 (A New Change of Variables for Efficient BRDF Representation).
 
-    A table is interpolated between its cells, and is reciprocal. A cell that was not measured has the value of the
-    cells around it, or is black if these were not measured either.
+    A table is interpolated between its cells. It is reciprocal. A cell that was not measured gets the value of the
+    cells around it. If these were not measured either, it is black.
 
-    A file of networks has the arrays ``names`` (M), ``w1`` (M, 6, 21), ``b1``, ``w2``, ``b2``, ``w3`` and ``b3``. A
-    network takes (sin θh, 0, cos θh) and the difference vector. It is reciprocal as far as its fit is. Angles are
-    clamped to θh = 80° and θd = 65°.
+    A file of networks has the arrays ``names`` (M), ``w1`` (M, 6, 21), ``b1``, ``w2``, ``b2``, ``w3`` and ``b3`` for M
+    materials. The input of a network is (sin θh, 0, cos θh) and the difference vector. Networks are only approximately
+    reciprocal. Angles are clamped to θh ≤ 80° and θd ≤ 65°.
 
-    Directions are sampled from a mixture of the cosine lobe and of half vectors with the brightness that the material
-    has at θd = 30°.
+    One half of the directions is sampled from the cosine lobe. The other half is sampled by half vectors; their density
+    follows the brightness of the material at θd = 30°.
 
     What it does not do: it has no differentiable parameters, no second side, and only RGB colours. Nothing enforces
     that it conserves energy. It needs one of Mitsuba's variants ``llvm_*_rgb`` or ``cuda_*_rgb``.
@@ -80,7 +79,7 @@ class Merl(mi.BSDF):
         self.m_flags = self.m_components[0]
 
     def reflected(self, si, wo, active):
-        """Evaluate the BRDF times the cosine, f (n·i) [1/sr]."""
+        """Evaluate the BRDF times the cosine, f (n·i) [1/sr], for light from direction `wo`."""
         h = dr.normalize(si.wi + wo)
         sin = dr.sqrt(h.x * h.x + h.y * h.y)
         across = sin > 1e-7
@@ -94,7 +93,7 @@ class Merl(mi.BSDF):
         return dr.select(active & (si.wi.z > 0) & (wo.z > 0), value, 0)
 
     def density(self, si, wo, active):
-        """Density [1/sr] of the directions that `sample` draws."""
+        """Compute the probability density [1/sr] with which `sample` draws the direction `wo`."""
         h = dr.normalize(si.wi + wo)
         sin = dr.maximum(dr.sqrt(h.x * h.x + h.y * h.y), MIN_ROOT**2)
         root = dr.sqrt(dr.minimum(dr.atan2(sin, h.z) / (dr.pi / 2), 1))

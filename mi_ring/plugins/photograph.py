@@ -68,9 +68,11 @@ class Photograph(mi.Sensor):
     ``centre``       point (2)    ``cx``, ``cy`` [px]                                                    P, ∂
     ================ ============ ====================================================================== =====
 
-    Every integrator sees the nested light while it renders this sensor, through the `flash` emitter that a `shapenet`
-    shape carries. What it does not do: depth of field, other lens distortion, motion blur; light tracing integrators
-    (``ptracer``) and the ``batch`` sensor cannot see the nested light.
+    A `shapenet` shape contains a `flash` emitter. Through it, every integrator that renders this sensor uses the nested
+    light.
+
+    What it does not do: depth of field, other lens distortion, motion blur. Integrators that trace light
+    (``ptracer``) and the ``batch`` sensor cannot use the nested light.
 
     .. tab-set-code::
 
@@ -140,16 +142,16 @@ class Photograph(mi.Sensor):
 
     @property
     def camera(self) -> Camera:
-        """Return the camera as plain numbers, from the plugin's current parameters."""
+        """The camera as plain numbers, from the current parameters of the plugin."""
         matrix, distortion = np.array(self.to_world.matrix).reshape(4, 4), float(np.ravel(self.distortion)[0])
         size = tuple(map(int, self.film().size()))
         return Camera(matrix, np.array(self.focal).ravel(), np.array(self.centre).ravel(), size, distortion)
 
     @property
     def shot(self) -> Shot:
-        """Return the photograph as plain data, from the plugin's current parameters.
+        """The photograph as plain data, from the current parameters of the plugin. No image is read.
 
-        Raises SceneError if its light is neither a point light nor a distant one.
+        Raises SceneError if the nested light is neither a point light nor a directional light.
         """
         if (kind := self.light.class_name()) not in LAMP_CLASSES:
             raise SceneError(f'photograph "{self.id()}": nested emitter is a {kind}, must be "point" or "directional"')

@@ -14,11 +14,12 @@ from mi_ring.scene.mesh_attributes import require_attributes
 
 
 class Photometric(ADIntegrator):
-    """The paper's image formation (equation 2): camera k sees the object lit by light k alone.
+    """The paper's image formation (equation 2): in photograph k, only light k lights the object.
 
-    Direct light only: radiance is B · max(0, n·i) · intensity / d² for the nested point light of the rendered
-    photograph, and B · max(0, n·i) · irradiance for a nested directional light. Emitters at the top level of the scene,
-    like an environment map or a lamp, light every photograph, by one emitter sample each.
+    The integrator computes direct light. The radiance is B · max(0, n·i) · intensity / d² for a point light that is
+    nested in the rendered photograph, and B · max(0, n·i) · irradiance for a nested directional light. Emitters at the
+    top level of the scene, such as an environment map or a lamp, light every photograph. The integrator takes one
+    sample of each.
 
     =========== ======= =============================================================================== =====
     Parameter   Type    Description                                                                     Flags
@@ -26,17 +27,18 @@ class Photometric(ADIntegrator):
     ``shadows`` boolean do the photographs' own lights cast shadows? Default: true
     =========== ======= =============================================================================== =====
 
-    The number of samples per pixel is that of the sampler. Alpha is the coverage of the pixel by all shapes.
+    The sampler of the sensor says the number of samples per pixel. The alpha channel is the share of the pixel that
+    shapes cover.
 
-    Gradients, by `mi.render` and by `render_photographs`, are those with respect to vertices, BSDFs, cameras, lights
-    and the placement of other shapes. Those of shading are by automatic differentiation. Those of moving outlines,
-    creases and edges of cast shadows are by edge sampling (Li et al. 2018, "Differentiable Monte Carlo Ray Tracing
-    through Edge Sampling"), for meshes, rectangles, disks, spheres and cylinders.
+    `mi.render` and `render_photographs` give gradients with respect to vertices, BSDFs, cameras, lights and the
+    placement of other shapes. Automatic differentiation gives the gradients of shading. Edge sampling (Li et al. 2018,
+    "Differentiable Monte Carlo Ray Tracing through Edge Sampling") gives the gradients of moving outlines, creases and
+    edges of cast shadows, for meshes, rectangles, disks, spheres and cylinders.
 
-    What it does not do: interreflection. Shapes that are emitters give light, but the camera sees them black. Emitters
-    at the top level always cast shadows. The common parameters of Mitsuba's integrators (``max_depth``,
-    ``hide_emitters``, …) are accepted and have no effect. Gradients need an RGB variant and a `photograph` sensor. Soft
-    shadows of area lights and environment maps have no gradients of their motion.
+    What it does not do: interreflection. Shapes that are emitters give light, but the camera sees them black. The light
+    of emitters at the top level always casts shadows. The common parameters of Mitsuba's integrators (``max_depth``,
+    ``hide_emitters``, …) are accepted and have no effect. Gradients need an RGB variant and a `photograph` sensor. The
+    motion of soft shadows, of area lights and environment maps, has no gradients.
 
     .. tab-set-code::
 
@@ -63,7 +65,7 @@ class Photometric(ADIntegrator):
         return radiance, si.is_valid(), [], None
 
     def require_attributes(self, scene):
-        """Check, once per scene, that all meshes have the attributes that their BSDFs read."""
+        """Raise SceneError if a mesh lacks an attribute that its BSDF reads. Checks each scene once."""
         shapes = scene.shapes()  # keeping the scene, which holds this integrator, would be a cycle
         if shapes != self.checked:
             for shape in shapes:
@@ -71,7 +73,11 @@ class Photometric(ADIntegrator):
             self.checked = shapes
 
     def differentiable(self, scene, sensor, seed, spp):
-        """Render the image with gradients for all parameters, including the boundary terms of moving edges."""
+        """Render an image that is attached to all parameters of the scene. Gradients include those of moving edges.
+
+        `sensor`: a `photograph`, or its index in the scene. Raises ValueError for another kind of sensor and for a
+        variant that is not RGB.
+        """
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         if not (mi.is_rgb and isinstance(sensor, Photograph)):

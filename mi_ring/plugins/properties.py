@@ -1,4 +1,4 @@
-"""Reading the properties of plugins: files, numbers, vectors."""
+"""Reads the properties of plugins: file names, numbers and vectors."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +8,10 @@ import numpy as np
 
 
 def beside_scene(name: str) -> Path:
-    """Resolve a file name in a scene relative to the scene's folder; without one, to the working folder."""
+    """Return the path of the file `name` in a scene: relative to the folder of the scene file.
+
+    A scene without a file uses the working folder. The file need not exist.
+    """
     return Path(str(mi.file_resolver()[0])) / name
 
 
@@ -16,9 +19,10 @@ LARGEST = 1e18  #: number whose square is finite in float32
 
 
 def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
-    """Read a number from a plugin's properties. Its square must be finite; with `positive` its inverse, too.
+    """Read the property `name` of a plugin as a number. `default`: the value if the property is missing.
 
-    `default`: the value if the property is missing. Raises ValueError for anything else.
+    Raises ValueError if it is no number, or if its absolute value exceeds 1e18, so that its square is finite in
+    float32. With `positive`, the number must be at least 1e-18, so that 1 / number² is finite, too.
     """
     value = props.get(name, default)
     least = 1 / LARGEST if positive else -LARGEST
@@ -29,9 +33,9 @@ def number(props, name: str, default: float | None = None, positive: bool = Fals
 
 
 def vector(props, name: str, kind: str) -> np.ndarray | None:
-    """Read the <point> or <vector> (`kind`) `name` from a plugin's properties: (3,), or None if missing.
+    """Read the property `name` of a plugin as an array (3,). Returns None if the property is missing.
 
-    Raises ValueError for anything else.
+    `kind`: "point" or "vector", for the message. Raises ValueError if the property is not three finite numbers.
     """
     if name not in props:
         return None
@@ -42,7 +46,11 @@ def vector(props, name: str, kind: str) -> np.ndarray | None:
 
 
 def number_list(props, name: str, counts: Sequence[int]) -> list[float]:
-    """Read a string of numbers from a plugin's properties. Raises ValueError unless `counts` contains their number."""
+    """Read the property `name` of a plugin: a string of numbers, separated by spaces or commas.
+
+    `counts`: how many numbers are allowed, for example (1, 3). Raises ValueError for another count, and for a word that
+    is no number or exceeds 1e18.
+    """
     text = str(props.get(name, ""))
     try:
         values = [float(word) for word in text.replace(",", " ").split()]

@@ -13,9 +13,10 @@ from mi_ring.rendering.spherical_harmonics import MAX_ORDER, to_camera_axes
 
 
 class Room(InvisibleEmitter):
-    """Light from infinitely far away that varies slowly with direction, as spherical harmonics up to order 4.
+    """Light from infinitely far away, as spherical harmonics up to order 4 of the direction.
 
-    It is fixed in the world, or in the camera like the room around a turntable.
+    The light does not move in the world. Or it does not move relative to the camera: this is the light of the room if
+    the object turns on a turntable.
 
     ============= ======= ============================================================================= =====
     Parameter     Type    Description                                                                   Flags
@@ -27,11 +28,11 @@ class Room(InvisibleEmitter):
                           `photograph`; then black for other kinds of sensors. Default: ``world``
     ============= ======= ============================================================================= =====
 
-    It lights every photograph, but cameras do not see it: the background stays black. A fit finds it by
-    ``--refine ambient``. The radiance may be a little below 0 in some directions, as a sum of few harmonics can be.
+    It lights every photograph, but cameras do not see it: the background stays black. A fit with ``--refine ambient``
+    estimates it. The radiance may be a little below 0 in some directions, because the harmonics are few.
 
-    What it does not do: importance sampling. Stock integrators sample its directions uniformly, so glossy surfaces are
-    noisy.
+    What it does not do: importance sampling. Mitsuba's own integrators sample its directions uniformly, so glossy
+    surfaces are noisy.
 
     .. tab-set-code::
 

@@ -52,9 +52,9 @@ class ShapeNetMesh(mi.Mesh):
     ==================== ===== ========================================================================== =======
 
     The mesh has smooth normals, and an attribute ``vertex_<parameter>`` for each parameter that the fit in ``weights``
-    predicts: for `cooktorrance` ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and ``vertex_roughness`` (1).
-    Without ``weights`` it has these three, with the values 0.5, 0 and 0.5. A nested BSDF that reads another attribute,
-    or an attribute with another number of channels, is an error.
+    predicts. For `cooktorrance` these are ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
+    ``vertex_roughness`` (1). Without ``weights`` the mesh has the same three, with the values 0.5, 0 and 0.5. An error
+    is raised if the nested BSDF reads an attribute that the mesh does not have, or one with another number of channels.
 
     What it does not do: texture coordinates; colours in spectral variants, where Mitsuba reads attributes of three
     channels as coefficients of a spectrum.

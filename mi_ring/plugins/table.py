@@ -10,7 +10,7 @@ TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 
 
 class Table(mi.Mesh):
-    """A rectangle on which the object stands. It reflects light onto the object and hides the room's light from it.
+    """A rectangle on which the object stands. It reflects light onto the object and blocks the room's light from below.
 
     ============ ========= ========================================================================= =====
     Parameter    Type      Description                                                               Flags
@@ -19,11 +19,11 @@ class Table(mi.Mesh):
     (nested)     bsdf      usually diffuse with a bitmap; the first row of a bitmap is at y = −1     P, ∂
     ============ ========= ========================================================================= =====
 
-    Stock integrators render it like any other rectangle. In the photographs that a fit predicts it is part of
-    interreflection only, and cameras do not see it: a fit compares the object inside of its mask. ``mi-ring photos``
-    writes a table if it finds the printed sheet.
+    Mitsuba's own integrators render it like any other rectangle. In the photographs that a fit predicts, the table only
+    takes part in interreflection; cameras do not see it. ``mi-ring photos`` writes a table if it finds the printed
+    sheet.
 
-    What it does not do: in these predictions it hides nothing from a camera or a lamp.
+    What it does not do: in the predictions of a fit, the table hides nothing from a camera or a lamp.
 
     .. tab-set-code::
 

@@ -1,4 +1,4 @@
-"""Predicted photographs of a surface and their gradients: cameras, lights, edges, and the seam to torch.
+"""Predicted photographs of a surface and their gradients: cameras, lights, edges, and the bridge to torch.
 
 May import: mitsuba, drjit, numpy, torch; foreign, images, nets, scene, geometry.
 """

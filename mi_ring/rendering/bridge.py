@@ -1,4 +1,4 @@
-"""The seam between torch and Dr.Jit: arrays that share their memory, and Dr.Jit programs that torch differentiates."""
+"""The bridge between torch and Dr.Jit: arrays that share memory, and Dr.Jit programs that torch differentiates."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ def to_torch(array: mi.Float) -> Tensor:
 
 
 def evaluated(arrays: Sequence[mi.Float]) -> list[Tensor]:
-    """Evaluate Dr.Jit Floats in one kernel, and convert each to a tensor as `to_torch` does."""
+    """Evaluate Dr.Jit Floats together, in one kernel. Returns them as tensors, which `to_torch` makes."""
     dr.eval(arrays)
     return [to_torch(array) for array in arrays]
 
@@ -29,9 +29,10 @@ def evaluated(arrays: Sequence[mi.Float]) -> list[Tensor]:
 def differentiable(program: Callable, tensors: Sequence[Tensor], target) -> tuple[Tensor, ...]:
     """Run a Dr.Jit program. Returns its output as tensors (n,) that are differentiable with respect to `tensors`.
 
-    `program`: function from a list of flat Floats (attached where the tensor requires a gradient) to a list of Floats.
-    It writes its input to `target`, which counts writes in `written`. The backward pass raises RuntimeError if it runs
-    twice, or if `target` was written again in between.
+    `program`: a function from a list of flat Floats to a list of Floats. Its input has the values of `tensors`; it is
+    attached if the tensor requires a gradient. `target`: the object that the program writes its input to; it counts
+    writes in the attribute `written`. The backward pass raises RuntimeError if it runs twice, or if `target` was
+    written again before it.
     """
     return _Differentiable.apply(program, target, *tensors)
 

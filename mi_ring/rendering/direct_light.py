@@ -1,4 +1,4 @@
-"""Direct light: the light of lamps that a surface reflects once, toward the camera (equation 2 of the paper)."""
+"""Direct light: light that a surface reflects once, from a lamp to the camera (equation 2 of the paper)."""
 
 import drjit as dr
 import mitsuba as mi
@@ -10,12 +10,12 @@ MIN_COSINE = 1e-3  #: the least cosine between viewer and normal; smaller ones a
 
 
 def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
-    """Compute the radiance that surface interactions `si` send to the viewer; attached for gradients.
+    """Compute the radiance (Color3f) that the surface interactions `si` send to the viewer. It is attached.
 
-    `light(si)`: (DirectionSample3f, radiance · d⁻²) of the photograph's own light; or None. Other emitters get one
-    sample each, from `next_2d`. `shadows`: does the own light cast shadows? Others always do. `room_radiance(si)`, if
-    not None, is added. `rooms`: also sample the scene's `room` emitters, whose light `render_indirect` has with less
-    noise.
+    `light(si)`: returns (DirectionSample3f, radiance · d⁻²) of the photograph's own light. None: there is no such
+    light. `next_2d`: random numbers; each other emitter of the scene gets one sample. `shadows`: the own light casts
+    shadows; other emitters always do. `rooms`: also sample the scene's `room` emitters; `render_indirect` computes
+    their light with less noise. `room_radiance(si)`: radiance that is added; None: nothing is added.
     """
     context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
     # At an outline interpolated normals turn away before the faces do. A black strip there would be another edge.
@@ -40,7 +40,7 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
 
 
 def light_visible(scene, si, ds, active=True):
-    """Test whether nothing is between the surface at `si` and the light at direction sample `ds`."""
+    """Test whether nothing blocks the light between the surface at `si` and the light, at direction sample `ds`."""
     n, d = dr.detach(si.n), dr.detach(ds.d)
     origin = dr.detach(si.p) + n * dr.mulsign(ray_offset(dr.detach(si.p), dr.detach(si.t)), dr.dot(n, d))
     to_light = dr.detach(ds.p) - origin
@@ -51,9 +51,9 @@ def light_visible(scene, si, ds, active=True):
 
 
 def next_2d(seed, lanes, stream=None):
-    """Make a random number generator: a function that returns points in [0, 1)², independent for each lane.
+    """Make a random number generator for a number of `lanes`: a function that returns new points in [0, 1)².
 
-    `stream` (UInt32): random stream of each lane; default: the number of the lane.
+    The points of all lanes are independent. `stream` (UInt32): random stream of each lane; default: the lane's number.
     """
     # Hashed as in Mitsuba's samplers: without this, neighbouring streams are correlated.
     stream = dr.arange(mi.UInt32, lanes) if stream is None else stream
@@ -63,10 +63,10 @@ def next_2d(seed, lanes, stream=None):
 
 
 def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
-    """Trace camera rays. Returns [R, G, B, coverage] of each lane; 0 where not `active`.
+    """Trace camera rays, one per lane. Returns [R, G, B, coverage] of each lane; lanes that are not `active` get 0.
 
-    Each lane is lit by the light of its photograph `view`. Room light is included without occlusion; `render_indirect`
-    adds the occlusion.
+    `view`: photograph of each lane; its light lights the surface. The radiance contains the room's light without
+    occlusion; `render_indirect` computes the occlusion.
     """
     shadows = shadows and photographs.casts_shadows
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)

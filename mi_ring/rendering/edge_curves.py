@@ -1,4 +1,9 @@
-"""Edges as curves in space: their samples, and the outlines and borders of shapes that are not meshes."""
+"""Edges as curves in space: samples of them, and the outlines and borders of shapes that are not meshes.
+
+`CURVES` has functions for the curves of these shapes, in local coordinates. Their arguments are the eye e, which is a
+point if w = 1 and a direction if w = 0, then w, and the curve parameter t in [0, 1). They return (point p, dp/dt, a
+point of the shape beside p).
+"""
 
 from dataclasses import dataclass
 
@@ -13,19 +18,17 @@ OUTLINE_OFFSET, SHADOW_OFFSET = 1e-4, 1e-2
 
 
 def ray_offset(point, distance):
-    """How far from `point` a ray must start so that it does not hit the surface it leaves [scene units].
+    """Compute at which distance from `point` a ray must start so that it does not hit the surface that it leaves.
 
-    It is proportional to the rounding error of the point, which was found by a ray of length `distance`.
+    The distance [scene units] is proportional to the rounding error of the point. `distance`: length of the ray that
+    has found the point.
     """
     return RELATIVE_OFFSET * (dr.max(dr.abs(point)) + distance)
 
 
 @dataclass
 class EdgeSamples:
-    """Samples of curves in space: outlines, creases and borders of shapes.
-
-    Their number may differ between photographs.
-    """
+    """Samples of curves in space, one per lane: outlines, creases and borders of shapes in several photographs."""
 
     view: mi.UInt32  #: the photograph
     lane: mi.UInt32  #: the number of the sample, the same whichever photographs are rendered together
@@ -40,16 +43,16 @@ class EdgeSamples:
 # Curves of such shapes in local coordinates: (p, dp/dt, a point of the shape beside p) as functions of t in [0, 1) and
 # of the eye e, which is a point for w = 1 and a direction for w = 0.
 def circle(u, v, t):
-    """The unit circle in the plane of unit vectors `u`, `v`.
+    """Evaluate the unit circle in the plane of the unit vectors `u` and `v` at the parameter `t` in [0, 1).
 
-    Returns (point, derivative with respect to `t` in [0, 1)).
+    Returns (point, derivative with respect to `t`).
     """
     s, c = dr.sincos(2 * dr.pi * t)
     return u * c + v * s, 2 * dr.pi * (v * c - u * s)
 
 
 def square_border(e, w, t):
-    """The border of the square [-1, 1]² as a curve; arguments and result as for all `CURVES`."""
+    """Evaluate the border of the square [-1, 1]². Arguments and result: see the docstring of the module."""
     side, along = dr.floor(4 * t), 8 * (t - 0.25 * dr.floor(4 * t)) - 1
     x = dr.select(side == 0, along, dr.select(side == 1, 1, dr.select(side == 2, -along, -1)))
     y = dr.select(side == 0, -1, dr.select(side == 1, along, dr.select(side == 2, 1, -along)))
@@ -59,19 +62,22 @@ def square_border(e, w, t):
 
 
 def disk_border(e, w, t):
-    """The border of the unit disk as a curve; arguments and result as for all `CURVES`."""
+    """Evaluate the border of the unit disk. Arguments and result: see the docstring of the module."""
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
     return mi.Point3f(p), dp, mi.Point3f(0)
 
 
 def cylinder_border(e, w, t, z):
-    """The circle at the end `z` of the unit cylinder as a curve; other arguments and result as for all `CURVES`."""
+    """Evaluate the circle at the end `z` of the unit cylinder. Other arguments and result: see the module."""
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
     return mi.Point3f(p.x, p.y, z), dp, mi.Point3f(p.x, p.y, 0.5)
 
 
 def sphere_outline(e, w, t):
-    """The outline of the unit sphere as a curve: points p · e = w, where the normal is perpendicular to the view."""
+    """Evaluate the outline of the unit sphere: points p with p · e = w, whose normal is perpendicular to the view.
+
+    Arguments and result: see the docstring of the module.
+    """
     e2 = dr.squared_norm(e)
     frame = mi.Frame3f(e * dr.rsqrt(e2))
     p, dp = circle(frame.s, frame.t, t)
@@ -80,7 +86,10 @@ def sphere_outline(e, w, t):
 
 
 def cylinder_outline(e, w, t, side=1.0):
-    """One of two lines of the outline of the cylinder x² + y² = 1, 0 < z < 1, as a curve; `side`, 1 or -1: which."""
+    """Evaluate one of the two lines in the outline of the cylinder x² + y² = 1, 0 < z < 1. `side`, 1 or -1, says which.
+
+    Other arguments and result: see the docstring of the module.
+    """
     e2 = e.x * e.x + e.y * e.y
     r = side * dr.sqrt(dr.maximum(1 - w * w / e2, 0)) * dr.rsqrt(e2)
     p = mi.Point3f(e.x * w / e2 - e.y * r, e.y * w / e2 + e.x * r, t)
@@ -101,9 +110,9 @@ CURVES = {
 
 
 def outline_of(shape, eye, views, seed, before=0) -> list[EdgeSamples]:
-    """Sample outline and border of a shape that is not a mesh, as seen in each of `views` photographs.
+    """Sample outline and border of a shape that is not a mesh, for the `eye` in each of `views` photographs.
 
-    `eye`: see `Edges`. `before`: number of photographs before these, see `Photographs`.
+    Returns samples for each curve of the shape. `eye`: see `Edges`. `before`: see `Photographs.before`.
     """
     to_world = mi.traverse(shape)["to_world"]
     curves = []

@@ -1,4 +1,4 @@
-"""The boundary terms of a photograph's gradient: what it is because edges move."""
+"""The boundary terms of a photograph's gradient. They are the part of the gradient that comes from moving edges."""
 
 import drjit as dr
 import mitsuba as mi
@@ -11,13 +11,16 @@ EDGE_ROUNDINGS = 16  #: the least distance to rays beside an edge, in rounding e
 
 
 def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
-    """Compute the boundary terms of photographs, for each curve as (where [px], view, step, active) of its samples.
+    """Compute the boundary terms of photographs. Returns one tuple (where [px], view, step, active) for each curve.
 
-    An edge that moves by n·dq [px] sweeps length · n·dq square pixels, where radiance changes from L_beyond to
-    L_before. So dI = (L_before − L_beyond) · n·dq · length. Both are traced along rays beside the edge, which see
-    occlusion, background, coverage and shadows as the camera does. `step`, [R, G, B, coverage], is zero; its derivative
-    is dI, to be added to the pixel at `where`. `window`: (lowest, highest) corner [px] of the rendered part; edges
-    outside are left out. Default: all.
+    Each entry of the tuple has one value per sample of the curve: pixel coordinates, photograph, gradient, and whether
+    the sample counts. `step`, [R, G, B, coverage], is zero, but its derivative is the boundary term dI; the caller adds
+    it to the pixel at `where`.
+
+    An edge that moves by n·dq [px] sweeps length · n·dq square pixels. There, the radiance changes from L_beyond to
+    L_before. So dI = (L_before − L_beyond) · n·dq · length. Both radiances are traced along rays beside the edge, with
+    occlusion, background, coverage and shadows as in the picture. `edges`: the `Edges` of the scene. `window`: (lowest,
+    highest) corner [px] of the rendered part, default: all; edges outside of it are skipped.
     """
     window = window or (mi.Point2f(0), mi.Point2f(photographs.size))
     views, before = len(photographs), photographs.before
@@ -33,7 +36,7 @@ def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
 
 
 def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window):
-    """Compute `boundary_terms` for one curve; None if nothing moves the curve."""
+    """Compute the tuple of `boundary_terms` for one curve. Returns None if no gradient is wanted for its motion."""
     camera = photographs.camera(curve.view)
     where, depth = camera.project(curve.point)
     if not dr.grad_enabled(where):
@@ -69,9 +72,9 @@ def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window)
 
 
 def cast_shadow(scene, curve: EdgeSamples, light, camera) -> EdgeSamples:
-    """Project a curve along rays from the light onto the scene: the edge of the shadow that it casts.
+    """Project a curve along rays from the light onto the scene. The result is the edge of the shadow that it casts.
 
-    The result is attached to the light, to the curve and to the surface under the shadow. `light`, `camera`: see
+    The result is attached to the light, to the curve and to the surface under the shadow. `light`, `camera`: eyes; see
     `Edges`.
     """
     where, finite = light(curve.view)

@@ -1,4 +1,4 @@
-"""The edges of meshes at which a photograph is discontinuous: outlines, creases, edges of shadows."""
+"""Finds the edges at which a photograph is discontinuous: outlines, creases and edges of shadows."""
 
 import drjit as dr
 import mitsuba as mi
@@ -12,12 +12,12 @@ SAMPLES, MIN_SAMPLES = 4, 2048  #: per edge of a mesh, and at least for all edge
 
 
 class Edges:
-    """The edges of all shapes in a scene. Methods find those that are outlines for an eye.
+    """The edges of all shapes in a scene. The methods find the edges that are outlines for an eye.
 
-    An eye is a camera or a light: a function of the photograph (UInt32). It returns (Vector3f, Bool): a position and
-    True, or the direction toward an infinitely distant eye and False. It may be attached.
+    An eye is a camera or a light. It is given as a function of the photograph (UInt32), which returns (Vector3f, Bool):
+    (position, True), or (direction toward it, False) for an infinitely distant eye. The result may be attached.
 
-    Raises SceneError for a kind of shape whose outline is not known.
+    Raises SceneError if the scene has a shape of a kind whose outline is not known.
     """
 
     def __init__(self, scene):
@@ -47,7 +47,10 @@ class Edges:
 
     @classmethod
     def of(cls, scene, known: "Edges | None" = None) -> "Edges":
-        """Find the edges of a scene. Returns `known` itself if the scene's shapes and faces have not changed since."""
+        """Find the edges of a scene. `known`: edges from an earlier call.
+
+        Returns `known` itself if they belong to this scene and its shapes and triangles have not changed since.
+        """
         if known is not None and list(scene.shapes()) == known.shapes:
             now = (mesh.faces_buffer() for mesh in known.meshes)
             if all(a.index == b.index for a, b in zip(now, known.buffers)):
@@ -55,12 +58,15 @@ class Edges:
         return cls(scene)
 
     def positions(self):
-        """The vertex positions of all meshes as one Float, attached."""
+        """Return the vertex positions of all meshes as one Float. It is attached."""
         buffers = [mesh.vertex_positions_buffer() for mesh in self.meshes]
         return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
 
     def fronts(self, eye, views):
-        """Test which triangles face the eye: Bool over all triangles for photograph 0, then for photograph 1, …"""
+        """Test which triangles face the eye in each of `views` photographs.
+
+        Returns Bool: the values of all triangles for photograph 0, then the values for photograph 1, and so on.
+        """
         count = dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views)
         where, finite = eye(lane // count)
@@ -72,10 +78,10 @@ class Edges:
         return front
 
     def sides(self, fronts, lanes=None, views=1):
-        """For each lane, return (edge, does its first triangle face the eye?, does its second?).
+        """Return for each lane (edge, whether its first triangle faces the eye, whether its second triangle does).
 
-        `fronts`: from `fronts`. `lanes` (UInt32): photograph · number of edges + edge. Default: all edges in `views`
-        photographs.
+        `fronts`: result of `fronts`. `lanes` (UInt32): photograph · number of edges + edge. Default: all edges in
+        `views` photographs.
         """
         count, triangles = dr.width(self.kind), dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views) if lanes is None else lanes
@@ -86,7 +92,10 @@ class Edges:
         return edge, first, second
 
     def sample(self, lanes, seed, before=0, shadow=False) -> EdgeSamples:
-        """Sample points on edges, stratified. `lanes`: see `sides`. `shadow`: are they edges of shadows?"""
+        """Choose random points on edges, stratified along each edge. Returns at least four per edge.
+
+        `lanes`: the edges, see `sides`. `before`: see `Photographs.before`. `shadow`: the edges are edges of shadows.
+        """
         count = dr.width(self.kind)
         each = max(SAMPLES, MIN_SAMPLES // count)
         local = dr.arange(mi.UInt32, dr.width(lanes) * each)
@@ -101,7 +110,7 @@ class Edges:
         return EdgeSamples(chosen // count, lane, p, piece, self.middle(edge), mi.Bool(True), OUTLINE_OFFSET, shadow)
 
     def middle(self, edge):
-        """The mean of the centres of both triangles at an edge, detached."""
+        """Return the mean of the centres of both triangles at an edge. It is detached."""
         positions, corners = dr.detach(self.positions()), mi.Point3f(0)
         for face in (self.f0, self.f1):
             for vertex in dr.gather(mi.Point3u, self.corners, dr.gather(mi.UInt32, face, edge)):
@@ -111,7 +120,7 @@ class Edges:
     def outlines(self, eye, views, seed, before=0):
         """Sample all edges that may be outlines or creases for the `eye` in `views` photographs.
 
-        Returns (curves, the eye's `fronts`).
+        Returns (list of samples of curves; result of `fronts` for this eye, None if the scene has no mesh).
         """
         curves = [curve for shape in self.others for curve in outline_of(shape, eye, views, seed, before)]
         fronts = None
@@ -125,11 +134,12 @@ class Edges:
         return curves, fronts
 
     def shadow_casters(self, light, views, seed, seen, before=0):
-        """Sample edges that cast the edge of a shadow (casters), and those that are one themselves (terminators).
+        """Sample the edges that make edges of shadows: those that cast a shadow (casters), and terminators.
 
-        Returns (casters, terminators) for the eye `light`. `seen`: `fronts` of the cameras. Casters are the outlines
-        for the light. Terminators are casters of which the camera sees both triangles. The triangle that does not face
-        the light is black, even where interpolated normals face the light.
+        Returns (casters, terminators) for the eye `light`, two lists of samples of curves. Casters are the outlines as
+        seen from the light. Terminators are casters of which the camera sees both triangles: they separate lit and
+        unlit triangles. The unlit triangle is black, even where interpolated normals face the light. `seen`: result of
+        `fronts` for the cameras.
         """
         casters = [curve for shape in self.others for curve in outline_of(shape, light, views, seed, before)]
         terminators = []
@@ -148,9 +158,10 @@ class Edges:
 
 
 def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
-    """Find the edges of a mesh.
+    """Find the E edges of a mesh. `faces`: (F, 3). Returns (5, E).
 
-    Returns (5, E): vertices v0 and v1, triangles with (v0, v1) and with (v1, v0), the kind.
+    The rows are: vertex v0, vertex v1, the triangle with the side (v0, v1), the triangle with the side (v1, v0), and
+    the kind of the edge: SMOOTH, CREASE or BORDER.
     """
     weld = np.arange(mesh.vertex_count())
     table = paired_edges(faces, weld)
@@ -164,7 +175,7 @@ def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
 
 
 def paired_edges(faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
-    """Make the `edge_table` of a mesh with smooth normals. Vertices with equal `weld` (V,) are the same point."""
+    """Make the `edge_table` of a mesh with smooth normals. `weld` (V,): vertices with equal numbers are one point."""
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, 1).ravel().astype(np.int64)
     triangle = np.repeat(np.arange(len(faces)), 3)
     a, b = weld[start], weld[end]

@@ -1,4 +1,4 @@
-"""Interreflection and the light of the room in pictures of a surface: rendered small, then added to the large ones."""
+"""Interreflection and the light of the room: rendered in small pictures, and then added to the large pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ TABLE_WIDTH, TABLE_PATHS = 128, 3  #: the same with a table, whose pattern gloss
 class GlobalIllumination:
     """Interreflection and room light of N photographs, rendered as small pictures of h × w pixels.
 
-    The small pictures are scaled up to H × W pixels, the size at which direct light is rendered. `transfer` is the
+    Methods scale the small pictures up to H × W pixels, the size at which direct light is rendered. `transfer` is the
     radiance transfer of "Precomputed Radiance Transfer" (Sloan, Kautz and Snyder 2002).
     """
 
@@ -39,14 +39,14 @@ class GlobalIllumination:
         cls, surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int | None = None,
         paths: int | None = None, indirect: bool = True, harmonics: Sequence[int] = (),
     ) -> "GlobalIllumination":  # fmt: skip
-        """Render interreflection, and the `transfer` of some `harmonics`, for the current surface, without gradients.
+        """Render interreflection and the `transfer` of `harmonics` for the current surface, without gradients.
 
-        `photographs`: as they were rendered. `coverage` (N, H, W): of the large pictures. `width`: largest width of the
-        small pictures [px]; `paths`: paths per pixel. This light varies slowly, and a few good pixels are better than
-        many noisy ones. By default `width` and `paths` are larger where there is a table.
+        `photographs`: the N photographs. `coverage` (N, H, W): coverage in the large pictures. `width`: largest width
+        of the small pictures [px]. `paths`: paths per pixel. This light varies slowly, so a few good pixels are better
+        than many noisy ones. The defaults of `width` and `paths` depend on whether the scene has a table.
 
-        Without `indirect`, `transfer` has only room light that the surface reflects once, and `interreflection` must
-        not be used.
+        `indirect`: if it is false, `transfer` contains only room light that the surface reflects once; do not use
+        `interreflection` then.
         """
         bounces = BOUNCES if indirect else 1
         table = surface.table if indirect else None  # a table reflects light; alone it would hide the room's
@@ -62,17 +62,21 @@ class GlobalIllumination:
 
     @property
     def interreflection(self) -> Tensor:
-        """Linear radiance (N, H, W, 3) that interreflection adds to the large pictures."""
+        """The linear radiance (N, H, W, 3) that interreflection adds to the large pictures."""
         return self.upsampled(self.radiance)
 
     def room_light(self, room: Tensor) -> Tensor:
-        """Linear radiance (N, H, W, 3) that room light, `room` (BASIS, 3), adds to the large pictures."""
+        """Compute the linear radiance (N, H, W, 3) that room light adds to the large pictures.
+
+        `room` (BASIS, 3): spherical harmonics of the room light.
+        """
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
 
     def occlusion(self, room: Tensor) -> Tensor:
-        """Radiance (N, H, W, 3) that pictures with unoccluded room light lack: its shadows and interreflection.
+        """Compute the radiance (N, H, W, 3) to add to large pictures that contain room light without occlusion.
 
-        `room` (BASIS, 3): spherical harmonics. The shadows are negative.
+        It corrects them for the shadows of the room light, which are negative, and for its interreflection. `room`
+        (BASIS, 3): spherical harmonics of the room light.
         """
         difference = self.transfer - self.unoccluded
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))
@@ -80,8 +84,9 @@ class GlobalIllumination:
     def upsampled(self, rgb: Tensor) -> Tensor:
         """Scale small pictures (N, h, w, 3) up to (N, H, W, 3), with the outlines of the large pictures.
 
-        Gradients flow through `coverage` alone: the outline feels this light, shape and material do not. The fit
-        corrects shape and material for it as in "Shape from Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
+        The result has a gradient with respect to `coverage` only: this light acts on the outline, but not on shape and
+        material. Successive iterations of a fit take it into account for shape and material, as in "Shape from
+        Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
         """
         images = torch.cat([rgb, self.alpha[..., None]], -1).movedim(-1, 1)
         images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)

@@ -1,4 +1,4 @@
-"""Image formation: photographs of a scene, each lit by its own light, and maps of its surface."""
+"""Image formation: renders photographs of a scene, each under its own light, and maps of the surface."""
 
 import drjit as dr
 import mitsuba as mi
@@ -9,12 +9,12 @@ from mi_ring.rendering.photographs import center_rays, pixel_rays
 
 
 def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, pixels=None):
-    """Render the selected photographs in one launch. Returns [R, G, B, coverage]: Floats of N·H·W pixels, attached.
+    """Render the selected photographs together. Returns [R, G, B, coverage], attached Floats of N·H·W pixels.
 
-    They are box-filtered linear radiance. `spp`: samples per pixel. `shadows`: do the photographs' own lights cast
-    shadows? With `edges`, gradients contain the boundary terms of moving edges; otherwise only those of shading.
-    `pixels`: render only pixels from first to last, (first, last + 1), numbered through all photographs; not together
-    with `edges`.
+    R, G, B are box-filtered linear radiance. `spp`: samples per pixel. `shadows`: the photographs' own lights cast
+    shadows. `edges`: the `Edges` of the scene; gradients then contain the boundary terms of moving edges. If it is
+    None, gradients contain only shading. `pixels`: render only this range of pixels (first, last + 1), numbered through
+    all photographs; do not give it together with `edges`.
     """
     ray, view = pixel_rays(photographs, spp, seed, pixels)
     lane = dr.arange(mi.UInt32, dr.width(ray)) + photographs.first_lane(spp, pixels[0] if pixels else 0)
@@ -34,10 +34,11 @@ def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, 
 
 
 def render_maps(scene, photographs, attributes, pixels=None):
-    """Render normals and mesh attributes at pixel centres; 0 where there is no surface or no such attribute.
+    """Render normals and mesh attributes at the centres of pixels.
 
-    `attributes`: number of channels by name. `pixels`: as in `render_photographs`. Returns [nx, ny, nz, first
-    attribute, …]: Floats of N·H·W pixels; normals are in world space.
+    `attributes`: number of channels by name of the attribute. `pixels`: as in `render_photographs`. Returns Floats of
+    N·H·W pixels, [nx, ny, nz, first attribute, …]. Normals are in world space. Pixels that show no surface, or a
+    surface without the attribute, are 0.
     """
     si = scene.ray_intersect(center_rays(photographs, pixels)[0])
     maps = [dr.select(si.is_valid(), n, 0) for n in si.sh_frame.n]

@@ -1,4 +1,4 @@
-"""Indirect light: interreflection, and the light of the room with its occlusion, by path tracing without gradients."""
+"""Indirect light: path traces interreflection and the light of the room with its occlusion, without gradients."""
 
 import drjit as dr
 import mitsuba as mi
@@ -11,16 +11,18 @@ BOUNCES = 3  #: points of a path after the first surface
 
 
 def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=(), table=None):
-    """Render interreflection: [R, G, B, coverage], linear radiance, Floats of N·H·W pixels without gradients.
+    """Render interreflection. Returns [R, G, B, coverage], Floats of N·H·W pixels without gradients.
 
-    Paths start at the camera and sample BSDFs. At each of the `bounces` points after the first one the direct light is
-    added; the own light of each photograph casts shadows there. This is unbiased but for longer paths. `table`: a scene
-    that paths also hit after their first point; it casts no shadows.
+    R, G, B are linear radiance. Paths start at the camera and sample BSDFs. After the first point, a path has at most
+    `bounces` points. At each of these, the direct light is added; there the own light of each photograph casts shadows.
+    The result is unbiased except for the missing longer paths. `table`: a scene of tables; paths can hit it after their
+    first point, but it casts no shadows.
 
-    For n `harmonics` of `mi_ring.rendering.spherical_harmonics`, 6 n more Floats follow. The first 3 n are R, G, B of
-    the radiance transfer of each harmonic: the radiance in a room whose radiance is the harmonic, with occlusion and
-    with paths of at most `bounces` points. The last 3 n are the same without occlusion and interreflection, by
-    `reflected_harmonics`. Both groups have the same noise-free part; only occlusion and interreflection have noise.
+    `harmonics`: n indices of spherical harmonics. For these, 6 n more Floats follow. The first 3 n are R, G, B of the
+    radiance transfer of each harmonic: the radiance of the surface in a room whose radiance is this harmonic, with
+    occlusion and with paths of at most `bounces` points. The last 3 n are the same without occlusion and
+    interreflection; see `reflected_harmonics`. These have no noise. In the first 3 n, only occlusion and
+    interreflection have noise.
     """
     with dr.suspend_grad():
         ray, view = pixel_rays(photographs, spp, seed)
@@ -52,15 +54,16 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
 
 
 def trace_paths(scene, si, view, photographs, bounces, random, table=None, known=()):
-    """Trace one path per lane for the light that arrives at surface interactions `si` from other surfaces.
+    """Trace one path per lane for the light that arrives at the surface interactions `si` from other surfaces.
 
-    Returns (radiance, escaped, blocked). Radiance leaves `si` toward the viewer. `escaped` and `blocked` are each a
-    throughput and a direction: of paths that leave the scene, and of paths that hit another surface next to `si`. Both
-    throughputs are 0 for other paths.
+    Returns (radiance, escaped, blocked). `radiance` is the part of this light that `si` reflects to the viewer.
+    `escaped` is (throughput, direction) of the paths that leave the scene. `blocked` is (throughput, direction) of the
+    paths that start at a BSDF in `known` and hit another surface directly after `si`. All other paths have the
+    throughput 0.
 
-    `random`: a source of 2-D samples. `known`: BSDFs whose unoccluded room light the caller has from
-    `reflected_harmonics`. Of paths from these BSDFs, `escaped` leaves out those that leave the scene at once. Paths
-    that hit something at once are in `blocked`, for the caller to subtract.
+    `random`: function that returns 2-D samples. `known`: BSDFs whose room light without occlusion the caller adds by
+    `reflected_harmonics`. So `escaped` does not contain their paths that leave the scene directly after `si`, and the
+    caller subtracts the light of `blocked`.
     """
     context, active = mi.BSDFContext(), si.is_valid()
     radiance, throughput = mi.Color3f(0), mi.Color3f(1)

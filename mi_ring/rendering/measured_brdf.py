@@ -1,4 +1,4 @@
-"""Measured reflectance: tables of the MERL database, and networks that were fitted to such tables."""
+"""Evaluates measured reflectance: tables of the MERL database, and networks that were fitted to such tables."""
 
 from pathlib import Path
 
@@ -19,10 +19,10 @@ LAYERS = {"w1": (6, 21), "b1": (21,), "w2": (21, 21), "b2": (21,), "w3": (21, 3)
 class MerlTable:
     """A ``.binary`` file of the MERL database (Matusik et al. 2003), interpolated between its cells.
 
-    Cell i of θh is at the angle (i / 90)² · 90°; cells of θd and φd are 1° wide. By reciprocity φd and φd + π are the
-    same. Cells with negative values were not measured: they have the value of the cells around them.
+    Cell i of θh is at the angle (i / 90)² · 90°. The cells of θd and φd are 1° wide. Because of reciprocity, φd and
+    φd + π have the same value. A cell with a negative value was not measured; it gets the value of the cells around it.
 
-    Raises ValueError for a file that is not such a table.
+    Raises ValueError if the file is not such a table.
     """
 
     def __init__(self, path: Path):
@@ -46,7 +46,7 @@ class MerlTable:
         self.texture = mi.Texture3f(tensor, wrap_mode=dr.WrapMode.Clamp)
 
     def value(self, theta, d):
-        """Evaluate the BRDF (3 channels) [1/sr]. `theta` [rad]: angle of the half vector; `d`: difference vector."""
+        """Evaluate the BRDF as Color3f [1/sr]. `theta`: angle θh of the half vector [rad]. `d`: difference vector."""
         half = dr.sqrt(dr.clip(theta / (dr.pi / 2), 0, 1)) * CELLS[0]
         difference = dr.acos(dr.clip(d.z, 0, 1)) / (dr.pi / 2) * CELLS[1]
         turn = dr.atan2(d.y, d.x) / dr.pi
@@ -59,7 +59,7 @@ class MerlTable:
 class MerlNetwork:
     """A network of 6-21-21-3 neurons that was fitted to a table ("Neural BRDF Representation", Sztrajman 2021).
 
-    Raises InputError for a file that does not hold such networks, and for an unknown material.
+    Raises InputError if the file contains no such networks, and for an unknown material.
     """
 
     def __init__(self, path: Path, material: str):
@@ -77,7 +77,7 @@ class MerlNetwork:
         self.layers = [arrays[name][names.index(material)].astype(float).tolist() for name in LAYERS]
 
     def value(self, theta, d):
-        """Evaluate the BRDF, with arguments and result of `MerlTable.value`."""
+        """Evaluate the BRDF. Arguments and result: as for `MerlTable.value`."""
         theta = dr.minimum(theta, float(FITTED_ANGLES[0]))
         sin = dr.sqrt(dr.maximum(1 - d.z * d.z, 0))
         narrowed = dr.minimum(sin, float(np.sin(FITTED_ANGLES[1])))
@@ -90,7 +90,10 @@ class MerlNetwork:
 
 
 def dense_layer(x: list, weights: list, biases: list) -> list:
-    """Multiply x (n) by weights (n, m) and add biases (m). Dr.Jit's own layers need half precision on a GPU."""
+    """Multiply x (n) by weights (n, m) and add biases (m). Returns a list of m Floats.
+
+    Dr.Jit's own layers need half precision on a GPU.
+    """
     sums = [mi.Float(bias) for bias in biases]
     for value, row in zip(x, weights):
         sums = [dr.fma(value, weight, sum_) for weight, sum_ in zip(row, sums)]

@@ -1,4 +1,4 @@
-"""The lights of many photographs as Dr.Jit buffers, and the light that a surface receives from each."""
+"""The lights of many photographs as Dr.Jit buffers, and the light that a surface receives from each of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Lights:
     def of(cls, shots: Sequence[Shot]) -> "Lights":
         """Collect the lights of photographs.
 
-        Raises SceneError if a light is not finite, or if some but not all are black.
+        Raises SceneError if a light is not finite or negative, or if some lights are black but not all.
         """
         lights = [shot.own_light for shot in shots]
         finite = np.array([light.kind == "point" for light in lights])
@@ -48,19 +48,19 @@ class Lights:
 
     @classmethod
     def attached(cls, emitter) -> "Lights":
-        """Make the buffers of one point light or distant light, attached to the emitter's parameters."""
+        """Make the buffers of one point or directional emitter. They are attached to the emitter's parameters."""
         place, finite = position_of(emitter)
         return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength_of(emitter))))
 
     def eye(self, k):
-        """Return light `k`, one number per lane, as an eye; see `Edges`.
-
-        It is a position, or the direction toward a distant light.
-        """
+        """Return light `k` as an eye; see `Edges`. `k`: one number per lane."""
         return dr.gather(mi.Vector3f, self.places, k), dr.gather(mi.Bool, self.finite, k)
 
     def sample(self, k, si):
-        """Sample light `k`, one number per lane, at surface interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
+        """Sample light `k` at the surface interactions `si`. Returns (DirectionSample3f, radiance · d⁻²).
+
+        `k`: one number per lane.
+        """
         where, finite = self.eye(k)
         strength = dr.gather(mi.Color3f, self.strengths, k)
         ds = dr.zeros(mi.DirectionSample3f)
@@ -79,36 +79,39 @@ class Lights:
         return Light("point", place, rgb) if self.is_finite()[k] else Light("directional", -place, rgb)
 
     def is_finite(self) -> np.ndarray:
-        """Test which lights are point lights, (N,) bool. The others are distant."""
+        """Test which lights are point lights. Returns (N,) bool. The others are distant."""
         return np.array(self.finite)
 
     def positions(self) -> np.ndarray:
-        """Positions (N, 3) [scene units], or unit directions toward distant lights."""
+        """Return the positions (N, 3) [scene units]; for distant lights, unit directions toward them."""
         return np.array(self.places).reshape(-1, 3).astype(float)
 
     def rgb(self) -> np.ndarray:
-        """Intensities (N, 3) [W/sr], or irradiances of distant lights [W/m²]."""
+        """Return the intensities (N, 3) [W/sr]; for distant lights, irradiances [W/m²]."""
         return np.array(self.strengths).reshape(-1, 3).astype(float)
 
     def toward(self, point: np.ndarray) -> np.ndarray:
-        """Vectors (N, 3) from `point` (3,) to the lights [scene units]; unit directions for distant lights."""
+        """Return the vectors (N, 3) from `point` (3,) to the lights [scene units]; for distant lights, unit vectors."""
         places = self.positions()
         return np.where(self.is_finite()[:, None], places - point, places)
 
     def distances(self, point: np.ndarray) -> np.ndarray:
-        """Distances (N,) of the lights from a point (3,) [scene units]; infinite for distant lights."""
+        """Return the distances (N,) of the lights from a point (3,) [scene units]; infinite for distant lights."""
         return np.where(self.is_finite(), np.linalg.norm(self.toward(point), axis=1), np.inf)
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """Irradiance (N, 3) by each light at `point` (3,) on a surface that faces it: intensity / d² of equation 2."""
+        """Compute the irradiance (N, 3) of each light at `point` (3,), on a surface that faces the light.
+
+        It is intensity / d² in equation 2.
+        """
         distance2 = np.where(self.is_finite(), np.maximum((self.toward(point) ** 2).sum(1), 1e-24), 1.0)
         return self.rgb() / distance2[:, None]
 
 
 def flash_falloff(direction, to_world, falloff):
-    """Angular falloff of a flash: cosine of the angle to its axis, to the power `falloff`.
+    """Compute the factor by which a flash is weaker away from its axis: (cosine of the angle to the axis) ^ `falloff`.
 
-    `direction`: unit vector from the surface to the flash. The axis is the optical axis of the camera with pose
+    `direction`: unit vector from the surface to the flash. The axis is the optical axis of the camera whose pose is
     `to_world`.
     """
     cosine = -dr.dot(direction, mi.Vector3f(to_world[0, 2], to_world[1, 2], to_world[2, 2]))
@@ -116,7 +119,7 @@ def flash_falloff(direction, to_world, falloff):
 
 
 def toward(light: Light) -> np.ndarray:
-    """The unit direction (3,) toward a distant light."""
+    """Return the unit direction (3,) toward a distant light."""
     length = np.linalg.norm(light.vector)
     # What Mitsuba has read is of unit length, but for the rounding of float32.
     return -light.vector if abs(length - 1) < 1e-6 else -light.vector / length

@@ -19,9 +19,9 @@ LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
 
 @dataclass(frozen=True)
 class Photographs:
-    """Cameras and lights of all photographs of a scene, as Dr.Jit buffers, and the selection to render.
+    """Cameras and lights of all photographs of a scene, as Dr.Jit buffers, and which of them to render.
 
-    In methods, `view` (one number per lane) is an index into the selected photographs.
+    In methods, `view` is an index into the selected photographs, one number per lane.
     """
 
     views: Views  #: buffers of all photographs
@@ -36,10 +36,10 @@ class Photographs:
 
     @classmethod
     def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None) -> "Photographs":
-        """Collect cameras and lights of photographs; all are selected. `room` (BASIS, 3): room light.
+        """Collect cameras and lights of photographs. All are selected. `room` (BASIS, 3): room light.
 
-        `size` becomes that of the first photograph; `select` chooses photographs of equal size. Raises SceneError for
-        unsupported lights.
+        `size` is the size of the first photograph. If photographs have several sizes, use `select` before you render.
+        Raises SceneError for unsupported lights.
         """
         lights = Lights.of(shots)
         views = Views.of(shots, lights.positions(), lights.rgb())
@@ -53,7 +53,7 @@ class Photographs:
 
     @classmethod
     def attached(cls, sensor) -> "Photographs":
-        """Make the buffers of one photograph, attached to the parameters of the sensor and its light."""
+        """Make the buffers of one photograph. They are attached to the parameters of the sensor and of its light."""
         m = sensor.to_world.matrix
         light = Lights.attached(sensor.light)
         views = Views(
@@ -64,7 +64,11 @@ class Photographs:
         return replace(cls.of([sensor.shot]), views=views)
 
     def select(self, index: Sequence[int] | np.ndarray, size: tuple[int, int], scale: int = 1) -> "Photographs":
-        """Select photographs `index`, all of `size` (width, height) [px], to be rendered `scale` times smaller."""
+        """Return these photographs with another selection.
+
+        `index`: the photographs to select, all of `size` (width, height) [px]. `scale`: how many times smaller they
+        will be rendered.
+        """
         width, height = size
         views = self.views._replace(intrinsics=self.views.intrinsics / dr.opaque(mi.Float, scale))
         return replace(
@@ -72,7 +76,7 @@ class Photographs:
         )
 
     def with_views(self, views: Views) -> "Photographs":
-        """Return the photographs with other cameras and lights. No light then counts as colocated with its camera."""
+        """Return the photographs with other cameras and lights. `colocated` becomes False."""
         return replace(self, views=views, colocated=False)
 
     @property
@@ -81,7 +85,7 @@ class Photographs:
         return Lights(self.views.places, self.finite, self.views.strengths)
 
     def in_units(self, unit: float) -> "Photographs":
-        """Convert lengths to units of `unit` scene units. The pictures stay the same."""
+        """Return the photographs with all lengths in units of `unit` scene units. The pictures stay the same."""
         if unit == 1:
             return self
         views = self.views
@@ -95,7 +99,7 @@ class Photographs:
         return dr.width(self.index)
 
     def camera(self, view) -> Pinhole:
-        """The camera of each photograph `view`."""
+        """Return the camera of photograph `view`."""
         k = dr.gather(mi.UInt32, self.index, view)
         rows = [dr.gather(mi.Vector4f, self.views.cameras, 3 * k + row) for row in range(3)]
         f = dr.gather(mi.Vector4f, self.views.intrinsics, k)
@@ -104,15 +108,15 @@ class Photographs:
         return Pinhole(to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w), distortion)
 
     def eye(self, view):
-        """The camera position of photograph `view` as an eye; see `Edges`."""
+        """Return the camera of photograph `view` as an eye; see `Edges`."""
         return mi.Vector3f(self.camera(view).position), mi.Bool(True)
 
     def source(self, view):
-        """The light of photograph `view` as an eye; see `Edges`."""
+        """Return the light of photograph `view` as an eye; see `Edges`."""
         return self.lights.eye(dr.gather(mi.UInt32, self.index, view))
 
     def light(self, view, si):
-        """Sample the light of photograph `view` at surface interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
+        """Sample the light of photograph `view` at the interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
         k = dr.gather(mi.UInt32, self.index, view)
         ds, radiance = self.lights.sample(k, si)
         if self.views.falloff is not None:
@@ -123,7 +127,7 @@ class Photographs:
 
     @property
     def casts_shadows(self) -> bool:
-        """Test whether the photographs' own lights can cast shadows that the cameras see."""
+        """Do the photographs' own lights cast shadows that the cameras can see?"""
         return not (self.colocated or self.dark)
 
     @property
@@ -132,13 +136,14 @@ class Photographs:
         return [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
 
     def lighting(self, view):
-        """Return the function si ↦ `light(view, si)`; None if the photographs have no lights of their own."""
+        """Return the function si ↦ `light(view, si)`. Returns None if the photographs have no lights of their own."""
         return None if self.dark else lambda si: self.light(view, si)
 
     def room_radiance(self, scene, view):
-        """Return a function of surface interactions: the room light that they reflect without occlusion, attached.
+        """Return a function of surface interactions that computes the room light which they reflect to the viewer.
 
-        None if there is no room light. `view`: photograph of each lane, because a room may turn with the camera.
+        The light is without occlusion, and attached. Returns None if there is no room light. `view`: photograph of each
+        lane; it matters if the room turns with the camera.
         """
         which = self.harmonics
         if not which:
@@ -152,9 +157,9 @@ class Photographs:
         return radiance
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """Irradiance (N, 3) at `point` (3,) on a surface that faces each light.
+        """Compute the irradiance (N, 3) by each photograph's light at `point` (3,), on a surface that faces the light.
 
-        If the photographs have no lights of their own: the mean irradiance by room light.
+        If the photographs have no lights of their own, it is the mean irradiance by the room light.
         """
         own = self.lights.irradiance(point)
         if self.dark and self.room is not None:
@@ -172,17 +177,20 @@ class Photographs:
         return math.prod(self.shape)
 
     def first_lane(self, spp: int, first: int = 0):
-        """Index of the first lane of the selection, or of pixel `first` in it, with `spp` lanes per pixel."""
+        """Return the number of the first lane of pixel `first` of the selection, with `spp` lanes per pixel.
+
+        Lanes are numbered through all photographs, also those that are rendered elsewhere; see `before`.
+        """
         return dr.opaque(mi.UInt32, (self.before * self.size[0] * self.size[1] + first) * spp % 2**32)
 
     def chunks(self, spp: int) -> Iterator[tuple[int, int]]:
-        """Split all pixels into ranges (first, last + 1) of at most `LANES` rays, with `spp` rays per pixel."""
+        """Split all pixels into ranges of at most `LANES` rays, with `spp` rays per pixel. Yields (first, last + 1)."""
         step = max(1, LANES // spp)
         return ((first, min(first + step, self.pixels)) for first in range(0, self.pixels, step))
 
 
 def pixel_position(photographs: Photographs, pixel):
-    """Return (photograph, column, row) of `pixel`, an index through all selected photographs."""
+    """Return (photograph, column, row) of a pixel. `pixel`: its number, counted through all selected photographs."""
     width, height = photographs.size
     view, pixel = pixel // (width * height), pixel % (width * height)
     return view, mi.Float(pixel % width), mi.Float(pixel // width)
@@ -191,8 +199,8 @@ def pixel_position(photographs: Photographs, pixel):
 def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int, int] | None = None):
     """Generate `spp` stratified camera rays per pixel. Returns (rays, photograph of each lane).
 
-    The rays of a pixel are consecutive lanes. `pixels`: range (first, last + 1); default: all. A pixel has the same
-    rays in any range.
+    The rays of a pixel are in consecutive lanes. `pixels`: range of pixels (first, last + 1); default: all. The rays of
+    a pixel do not depend on the range.
     """
     first, last = pixels or (0, photographs.pixels)
     local = dr.arange(mi.UInt32, (last - first) * spp)

@@ -1,4 +1,4 @@
-"""Pinhole cameras with radial distortion in Dr.Jit: rays of pixels, and pixels of points."""
+"""Pinhole cameras with radial distortion in Dr.Jit: they convert pixels to rays and points to pixels."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ OUTSIDE = 1e6  #: factor of picture coordinates that puts a point outside of eve
 
 
 class Pinhole(NamedTuple):
-    """A camera, or one camera per lane; `mi_ring.geometry.camera.Camera` in Dr.Jit."""
+    """A camera in Dr.Jit, or one camera per lane. It has the parameters of `mi_ring.geometry.camera.Camera`."""
 
     to_world: Any  #: Matrix4f camera-to-world, Mitsuba's camera axes: x left, y up, z forward
     focal: Any  #: Point2f, focal lengths (fx, fy) [px]
@@ -24,7 +24,7 @@ class Pinhole(NamedTuple):
         return mi.Point3f(self.to_world[0, 3], self.to_world[1, 3], self.to_world[2, 3])
 
     def ray(self, pixel):
-        """The ray (origin, unit direction) through continuous pixel coordinates, Point2f [px], x right, y down."""
+        """Compute the ray (origin, unit direction) through a pixel. `pixel`: Point2f [px], x right, y down."""
         x, y = (pixel.x - self.centre.x) / self.focal.x, (pixel.y - self.centre.y) / self.focal.y
         if self.distortion is not None:
             factor = undistortion_factor(self.distortion, x * x + y * y)
@@ -38,14 +38,14 @@ class Pinhole(NamedTuple):
         return self.position, dr.normalize(direction)
 
     def local(self, vector):
-        """Convert a direction from world to camera coordinates. It uses the inverse of the 3 × 3 part of `to_world`."""
+        """Convert a direction from world to camera coordinates, by the inverse of the 3 × 3 part of `to_world`."""
         # Not by the transpose, though it is a rotation: the gradient with respect to each entry would be wrong.
         return dr.rcp(mi.Matrix3f([[self.to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
 
     def project(self, point):
-        """Project a point.
+        """Project a point in the world: the inverse of `ray`.
 
-        Returns (pixel coordinates [px], depth along the optical axis [scene units]); inverse of `ray`.
+        Returns (pixel coordinates [px], depth along the optical axis [scene units]).
         """
         x, y, z = self.local(point - self.position)
         x, y = x / z, y / z
@@ -57,7 +57,10 @@ class Pinhole(NamedTuple):
         return mi.Point2f(self.centre.x - self.focal.x * x, self.centre.y - self.focal.y * y), z
 
     def project_tangent(self, point, tangent):
-        """Derivative of `project`: how a point moves in the picture [px] if it moves by `tangent` in the world."""
+        """Compute how `point` moves in the picture [px] if it moves by `tangent` in the world.
+
+        This is the derivative of `project`.
+        """
         x, y, z = self.local(point - self.position)
         dx, dy, dz = self.local(tangent)
         moved = mi.Vector2f(dx * z - x * dz, dy * z - y * dz) / (z * z)

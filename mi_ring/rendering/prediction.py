@@ -1,4 +1,4 @@
-"""Predicted photographs of a surface as tensors: with gradients for a fit, without them for pictures and maps."""
+"""Renders photographs of a surface as tensors: with gradients for a fit, without gradients for pictures and maps."""
 
 from collections.abc import Sequence
 
@@ -26,14 +26,15 @@ def render(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Render photographs of the surface, each under its own light. Returns differentiable tensors.
 
-    `vertices` (V, 3) [scene units]. `attributes`: by name, (V, 3) or (V,), the mesh attributes that the BSDF reads.
-    `photographs`: which to render, and at what size. `spp`: stratified samples per pixel. Equal `seed`, equal samples.
-    `shadows`: do the photographs' own lights cast shadows? `views`: other cameras and lights of all P photographs, as
-    tensors. `lamps`: other places and strengths, both (L, 3), of the scene's L lamps, see `Surface.relight`.
+    `vertices` (V, 3) [scene units]. `attributes`: the mesh attributes that the BSDF reads, (V, 3) or (V,), by name.
+    `photographs`: which photographs to render, and at what size. `spp`: stratified samples per pixel. `seed`: the same
+    seed gives the same samples. `shadows`: the photographs' own lights cast shadows. `views`: other cameras and lights
+    of all P photographs, as tensors. `lamps`: other places and strengths, both (L, 3), of the scene's L lamps; see
+    `Surface.relight`.
 
-    Returns (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). Gradients with respect to all tensors are
-    those of shading, of outlines and of edges of cast shadows, for radiance and for coverage. There can be one backward
-    pass, before the surface is written again; else it raises RuntimeError. Raises ValueError like `Surface.parameters`.
+    Returns (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). Their gradients with respect to all tensors
+    contain shading, outlines and edges of cast shadows. There can be one backward pass, before the surface is written
+    again; otherwise the backward pass raises RuntimeError. Raises the ValueError of `Surface.parameters`.
     """
     parameters = surface.parameters(vertices, attributes)
     others = [*(views or ()), *lamps]
@@ -58,9 +59,10 @@ def render(
 
 
 def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Tensor:
-    """Set the gradient (V, 3) to 0 at vertices (V, 3) where a triangle without area makes it infinite or NaN.
+    """Replace infinite and NaN entries of a gradient (V, 3) by 0 at the vertices of triangles without area.
 
-    The cause are Mitsuba's vertex normals. Other infinite or NaN entries stay. `faces`: (F, 3).
+    Mitsuba's vertex normals cause such entries. Infinite and NaN entries at other vertices stay. `vertices` (V, 3),
+    `faces` (F, 3): the mesh.
     """
     if gradient.isfinite().all():
         return gradient
@@ -75,7 +77,7 @@ def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Te
 
 
 def with_views(photographs: Photographs, views: Views) -> Photographs:
-    """Return photographs with other cameras and lights, given as tensors, without gradients."""
+    """Return the photographs with other cameras and lights. `views`: tensors; their gradients are lost."""
     return photographs.with_views(Views(*map(to_drjit, views)))
 
 
@@ -83,14 +85,15 @@ def draw(
     surface: Surface, photographs: Photographs, spp: int = 16, seed: int = 0, shadows: bool = True,
     indirect: bool = False, paths: int = 32, occlusion: bool = True,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Render photographs of the surface as last written, without gradients, in the processor's memory.
+    """Render photographs of the surface as it was last written, without gradients.
 
-    Arguments and result are those of `render`. `indirect` adds interreflection by `paths` per pixel of a picture that
-    is at most 128 pixels wide. The light of the photographs' room is always part of the pictures; without `occlusion`
-    as if nothing hid it from the surface.
+    Arguments and result: as for `render`; the tensors are on the CPU. `indirect`: add interreflection, rendered with
+    `paths` paths per pixel in a picture that is at most 128 pixels wide. The pictures always contain the light of
+    `photographs.room`. `occlusion`: the surface blocks a part of this light; otherwise it blocks none.
 
-    This takes about a gigabyte (`mi_ring.rendering.photographs.LANES` rays at once) and the memory of the pictures
-    themselves, however many pixels and samples there are. `indirect` or a room add about 100 MB for each photograph.
+    However many pixels and samples there are, this needs about a gigabyte of memory
+    (`mi_ring.rendering.photographs.LANES` rays at once) besides the pictures. `indirect` or a room need about 100 MB
+    more for each photograph.
     """
     own, parts = photographs.in_units(surface.unit), []
     for pixels in photographs.chunks(spp):
@@ -110,9 +113,10 @@ def draw(
 def maps(
     surface: Surface, photographs: Photographs, parameters: Sequence[Parameter] = COOK_TORRANCE
 ) -> dict[str, np.ndarray]:
-    """Render normals and BSDF parameters at the centres of pixels; 0 where there is no surface. See `draw`.
+    """Render normals and BSDF parameters at the centres of pixels, for the surface as it was last written.
 
-    Returns `normal` (N, H, W, 3) in world space and each of the `parameters` by its name, (N, H, W, 3) or (N, H, W).
+    Returns arrays by name: `normal` (N, H, W, 3) in world space, and each of the `parameters` (N, H, W, 3) or
+    (N, H, W). Pixels without a surface are 0.
     """
     own, parts = photographs.in_units(surface.unit), []
     attributes = {f"vertex_{p.name}": p.channels for p in parameters}

@@ -22,17 +22,17 @@ FRAMES = {"world": [*range(PER_FRAME)], "camera": [0, *range(PER_FRAME, BASIS)]}
 
 
 def harmonics_up_to(order: int, frames: Iterable[str]) -> list[int]:
-    """Indices of the harmonics up to degree `order`, in the coordinate frames `frames` ("world", "camera")."""
+    """List the indices of the harmonics up to degree `order` in the axes `frames`: "world", "camera" or both."""
     return sorted({k for frame in frames for k in FRAMES[frame][: (order + 1) ** 2]})
 
 
 def degree(k: int) -> int:
-    """Degree l of the harmonic with index `k`."""
+    """Return the degree l of the harmonic with index `k`."""
     return int((k if k < PER_FRAME else k - PER_FRAME + 1) ** 0.5)
 
 
 def room_of(scene) -> np.ndarray | None:
-    """Sum the `room` emitters of a scene: harmonics (BASIS, 3). None if there are none."""
+    """Sum the light of all `room` emitters of a scene. Returns harmonics (BASIS, 3); None if there are no emitters."""
     rooms = [emitter for emitter in scene.emitters() if is_room(emitter)]
     total = np.zeros((BASIS, 3))
     for room in rooms:
@@ -42,9 +42,9 @@ def room_of(scene) -> np.ndarray | None:
 
 
 def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
-    """Remove the `envmap` and `constant` emitters. Returns (new scene, harmonics (BASIS, 3) of their light).
+    """Make a scene without `envmap` and `constant` emitters. Returns (new scene, harmonics (BASIS, 3) of their light).
 
-    Without such emitters: (the same scene, None).
+    If the scene has no such emitters, returns (`scene`, None).
     """
     found = [lamp for lamp in shared_emitters(scene) if lamp.is_environment()]
     if not found:
@@ -65,13 +65,13 @@ def harmonics_of(environment) -> np.ndarray:
 
 
 def world_harmonics(directions: np.ndarray, order: int = MAX_ORDER) -> np.ndarray:
-    """Evaluate spherical harmonics up to degree `order` in unit directions (n, 3): ((order + 1)², n)."""
+    """Evaluate spherical harmonics up to degree `order` in unit directions (n, 3). Returns ((order + 1)², n)."""
     values = dr.sh_eval(mi.Vector3f(*directions.T.astype(np.float32)), order)
     return np.stack([np.asarray(value + dr.zeros(mi.Float, len(directions))) for value in values])
 
 
 def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of an environment map of `rows` × 2 `rows`.
+    """Compute the directions and sizes of the pixels of an environment map with `rows` rows and 2 `rows` columns.
 
     Returns (unit directions (2 rows², 3), solid angles (2 rows²,)). Latitude and longitude are as in Mitsuba's
     `envmap`: y is up, and -z is at the left and right borders.
@@ -83,12 +83,15 @@ def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def frames_of(scene) -> set[str]:
-    """Coordinate frames of a scene's `room` emitters, "world" or "camera"; {"world"} if there are none."""
+    """Return the set of coordinate frames of a scene's `room` emitters; {"world"} if there are no such emitters."""
     return {emitter.frame for emitter in scene.emitters() if is_room(emitter)} or {"world"}
 
 
 def evaluated_harmonics(direction, to_world, which: Sequence[int]) -> list:
-    """Evaluate the harmonics with indices `which` in a world direction, for a camera with pose `to_world`."""
+    """Evaluate the harmonics with indices `which` in a `direction` in the world. Returns a list of Floats.
+
+    `to_world`: pose of the camera, for the harmonics in its axes.
+    """
     order = max(map(degree, which))
     world = dr.sh_eval(direction, order) if min(which) < PER_FRAME else []
     camera = dr.sh_eval(to_camera_axes(direction, to_world), order) if max(which) >= PER_FRAME else []
@@ -96,22 +99,22 @@ def evaluated_harmonics(direction, to_world, which: Sequence[int]) -> list:
 
 
 def to_camera_axes(direction, to_world):
-    """Convert a direction from world to camera coordinates; `to_world`: pose of the camera."""
+    """Convert a direction from world to camera coordinates. `to_world`: pose of the camera."""
     return mi.Vector3f(*(dr.dot(mi.Vector3f(*(to_world[j, i] for j in range(3))), direction) for i in range(3)))
 
 
 def bsdfs_with_lobes(scene) -> list:
-    """List the BSDFs of a scene that have a method `lobes`, each once."""
+    """List the BSDFs of a scene that have a method `lobes`. Each BSDF is listed once."""
     found = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in scene.shapes()) if hasattr(bsdf, "lobes")}
     return list(found.values())
 
 
 def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], active=True) -> list:
-    """Radiance, one Color3f each, that `si` reflects when the light is each harmonic in `which`, without occlusion.
+    """Compute the radiance that the surface interactions `si` reflect if a harmonic is the light, without occlusion.
 
-    It is attached. A lobe multiplies each degree of the harmonics about its direction by a factor, as in "A
-    Signal-Processing Framework for Inverse Rendering" (Ramamoorthi and Hanrahan 2001). BSDFs not in `bsdfs` reflect
-    nothing.
+    Returns one Color3f for each harmonic in `which`. They are attached. A lobe of a BSDF multiplies each degree of the
+    harmonics about its direction by a factor, as in "A Signal-Processing Framework for Inverse Rendering" (Ramamoorthi
+    and Hanrahan 2001). A BSDF that is not in `bsdfs` reflects nothing. `to_world`: pose of the camera.
     """
     total = [mi.Color3f(0) for _ in which]
     for bsdf in bsdfs:
@@ -123,10 +126,10 @@ def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], a
 
 
 def room_envmap(room: np.ndarray, to_world: np.ndarray, rows: int = ENVMAP_ROWS) -> np.ndarray:
-    """Convert room light (BASIS, 3) to an environment map (rows, 2 rows, 3) like Mitsuba's `envmap`.
+    """Convert room light (BASIS, 3) to an environment map (rows, 2 rows, 3) for Mitsuba's `envmap`.
 
-    `to_world`: pose of the camera, with which a part of the room may turn. Radiance may be negative, because few
-    harmonics are used.
+    `to_world`: pose of the camera, for the harmonics in its axes. The radiance may be negative, because there are few
+    harmonics.
     """
     directions, _ = envmap_directions(rows)
     which, values = np.flatnonzero(room.any(1)).tolist() or [0], np.zeros((len(directions), 3))

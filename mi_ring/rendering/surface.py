@@ -17,16 +17,15 @@ RADII_IN_SCENE_UNITS = 1e-3, 1e4  #: the least and the largest radius that float
 
 
 class Surface:
-    """The `shapenet` shape of a loaded scene, to which torch tensors are written.
+    """The surface that is rendered: a mesh in a scene, to which vertices and attributes are written.
 
-    With a `FittedObject` the surface is a new shape with the BSDF of that object. It is in a new scene, which shares
-    all other objects with the given scene and leaves that as it is. Without a `FittedObject` the surface is the given
-    shape itself. Other shapes and top-level emitters of the scene are part of every picture, but are not changed. A
-    `table` is not visible: it only reflects light onto the other shapes.
+    `scene`, `shape`: a scene and its `shapenet` shape. `ring`: a fitted object. If it is given, the surface is a new
+    shape with the BSDF of this object, in a new scene. The new scene shares all other objects with `scene`, which does
+    not change. If `ring` is None, the surface is `shape` itself. Other shapes and top-level emitters are part of every
+    picture. A `table` is not visible: it only reflects light onto the other shapes.
 
-    `unit` is the number of scene units that are one unit of `scene`. Areas and their squares must be representable in
-    float32: an object that is alone in its scene, and tiny or enormous, is rendered in units of about its radius. With
-    `in_scene_units` it is not.
+    `unit` is the length of a unit of the new scene [scene units]. It is 1, except for a tiny or enormous object that is
+    alone in its scene: float32 could not represent its areas. `in_scene_units`: `unit` is always 1.
     """
 
     def __init__(
@@ -55,11 +54,11 @@ class Surface:
             self.faces, self.faces_changed = faces, True
 
     def parameters(self, vertices: Tensor, attributes: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Convert tensors to the mesh's parameters by name: vertices (V, 3) [scene units], attributes (V, 3) or (V,).
+        """Convert tensors to the parameters of the mesh. Writes nothing.
 
-        The vertices come first in the result, in units of `unit`.
-
-        Raises ValueError if the triangles need another number of vertices, or if an attribute has another size.
+        `vertices` (V, 3) [scene units]. `attributes`: (V, 3) or (V,) by name. Returns tensors by Mitsuba's name of the
+        parameter: first the vertices, in units of `unit`, then the attributes. Raises ValueError if the triangles need
+        another number of vertices, or if an attribute has another size.
         """
         needed = int(self.faces.max()) + 1
         if vertices.shape != (needed, 3):
@@ -73,16 +72,16 @@ class Surface:
         return {POSITIONS: vertices / self.unit} | {f"vertex_{name}": value for name, value in attributes.items()}
 
     def write(self, vertices: Tensor, attributes: dict[str, Tensor]) -> None:
-        """Write vertices (V, 3) [scene units] and attributes (V, 3) or (V,) to the shape, without gradients.
+        """Write vertices (V, 3) [scene units] and attributes (V, 3) or (V,) to the mesh, without gradients.
 
-        Raises ValueError like `parameters`.
+        Raises the ValueError of `parameters`.
         """
         self.write_arrays({name: to_drjit(t) for name, t in self.parameters(vertices, attributes).items()})
 
     def write_arrays(self, arrays: dict[str, mi.Float]) -> None:
-        """Write the mesh's `parameters` as Dr.Jit Floats, which may be attached.
+        """Write parameters of the mesh. `arrays`: Dr.Jit Floats by the names of `parameters`; they may be attached.
 
-        Attributes that are not written become 0 when the number of vertices changes: the BSDF must not read them.
+        If the number of vertices changes, an attribute that is not written becomes 0; the BSDF must not read it.
         """
         if self.faces_changed:
             self.params[self.prefix + FACES] = mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel())
@@ -93,7 +92,7 @@ class Surface:
         self.written += 1
 
     def relight(self, places: mi.Float, strengths: mi.Float) -> None:
-        """Change the scene's L lamps in this surface's scene; the original scene stays unchanged.
+        """Change the L lamps in this surface's scene. The scene that was given to the constructor does not change.
 
         `places` (3 L numbers): positions [scene units], or unit directions toward distant lamps. `strengths` (3 L
         numbers): intensities [W/sr], or irradiances [W/m²] of distant lamps. Both may be attached.
@@ -104,9 +103,9 @@ class Surface:
         move_lamps(self.scene, places, strengths)
 
     def show(self, ring: RenderedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
-        """Evaluate `ring` at domain points `s` (V, 3) and write the surface with triangles `faces` (F, 3).
+        """Evaluate a fitted object at the domain points `s` (V, 3), and write the resulting surface and material.
 
-        `time`: of the flow, in [0, 1].
+        `faces` (F, 3): triangles of the points. `time`: of the deformation, 0 to 1.
         """
         with torch.no_grad():
             self.set_faces(faces)

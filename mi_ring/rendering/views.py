@@ -1,4 +1,4 @@
-"""Cameras and lights of many photographs as arrays: what a fit refines and what the renderer reads."""
+"""Cameras and lights of many photographs as arrays. A fit refines them, and the renderer reads them."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ class Views(NamedTuple):
 
     @classmethod
     def of(cls, shots: Sequence[Shot], places: np.ndarray, strengths: np.ndarray) -> "Views":
-        """Collect the cameras of photographs as numpy arrays. `places` (P, 3), `strengths` (P, 3): their lights."""
+        """Collect the cameras of P photographs as numpy arrays. `places`, `strengths` (P, 3): the lights."""
         cameras = [shot.camera for shot in shots]
         return cls(
             np.stack([camera.to_world[:3] for camera in cameras]),
@@ -31,11 +31,11 @@ class Views(NamedTuple):
         )  # fmt: skip
 
     def to(self, device: Any) -> "Views":
-        """Move the tensors to another torch device."""
+        """Return these views on another torch device."""
         return Views(*(tensor.to(device) for tensor in self))
 
     def buffers(self) -> "Views":
-        """Convert numpy arrays to Dr.Jit buffers."""
+        """Return these views, which must be numpy arrays, as Dr.Jit buffers."""
         buffers = {name: mi.Float(array.astype(np.float32).ravel()) for name, array in self._asdict().items()}
         return Views(**buffers | {name: None for name in ("falloff", "distortion") if not getattr(self, name).any()})
 

@@ -1,4 +1,4 @@
-"""Makes scenes from parts of other scenes: with other lamps, another object, or without tables."""
+"""Makes scenes from parts of other scenes: with other lamps, with another object, or without tables."""
 
 from collections.abc import Iterable
 from typing import Any, Protocol
@@ -15,9 +15,10 @@ MAX_EXTENT = 4.0  #: radius of a ball that contains the object during a fit [rad
 
 
 class RenderedObject(Protocol):
-    """What a renderer needs of a fitted object: `FittedObject` has it. Tensors are torch's.
+    """The part of `FittedObject` that renderers need. Tensors are torch's.
 
-    The package `mi_ring.scene` must not import `mi_ring.objects`, so this protocol stands for that class.
+    The package `mi_ring.scene` must not import `mi_ring.objects`. So its functions name this protocol instead of
+    `FittedObject`.
     """
 
     center: Any  #: (3,) tensor of the normalising sphere [scene units]
@@ -26,45 +27,49 @@ class RenderedObject(Protocol):
     brdf_net: Any  #: its `bsdf_parameters` have the attributes that the BSDF reads
 
     def surface(self, s: Any, time: float = 1.0) -> Any:
-        """The surface points (V, 3) that belong to domain points (V, 3), at a `time` of the flow."""
+        """Compute the surface points (V, 3) of domain points `s` (V, 3). `time`: of the deformation, 0 to 1."""
         ...
 
     def __call__(self, s: Any, time: float = 1.0) -> tuple[Any, dict[str, Any]]:
-        """Surface points (V, 3), and the parameters of the BSDF by name, at domain points (V, 3)."""
+        """Compute (surface points (V, 3), BSDF parameters by name) at domain points `s` (V, 3)."""
         ...
 
 
 def top_level_emitters(scene) -> list:
-    """The emitters of a scene that are not part of its shapes."""
+    """List the emitters of a scene that do not belong to a shape."""
     of_shapes = [shape.emitter() for shape in scene.shapes() if shape.is_emitter()]
     return [emitter for emitter in scene.emitters() if emitter not in of_shapes]
 
 
 def lamps_of(scene) -> list:
-    """The point lights and directional lights at the top level of a scene, as emitters."""
+    """List the lamps of a scene: the point and directional emitters that do not belong to a shape."""
     return [emitter for emitter in top_level_emitters(scene) if emitter.class_name() in LAMP_CLASSES]
 
 
 def lamp_lights(scene) -> list[Light]:
-    """The lamps of a scene as lights."""
+    """Convert the lamps of a scene (see `lamps_of`) to lights, in the same order."""
     return [light_of(lamp) for lamp in lamps_of(scene)]
 
 
 def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
-    """Replace the lamps of a scene by these lights. Returns a new scene."""
+    """Make a scene in which `lamps` replace the lamps of `scene`. All other objects are shared with `scene`."""
     before = lamps_of(scene)
     others = [emitter for emitter in top_level_emitters(scene) if emitter not in before]
     return changed_scene(scene, emitters=[*others, *map(emitter_of, lamps)])
 
 
 def move_lamps(scene, places, strengths) -> None:
-    """Set places and strengths of the lamps of a scene from `with_lamps`: attached Floats with 3 numbers per lamp."""
+    """Change the L lamps of a scene from `with_lamps`, in place.
+
+    `places` (3 L numbers): positions [scene units], or unit directions toward distant lamps. `strengths` (3 L numbers):
+    intensities, or irradiances of distant lamps. Both are Dr.Jit Floats and may be attached.
+    """
     for k, lamp in enumerate(lamps_of(scene)):
         move_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
-    """Make a scene of these objects. They keep their ids. Meshes are not merged."""
+    """Make a scene of these Mitsuba objects. The objects keep their ids, and meshes are not merged."""
     parts = [*shapes, *emitters, *sensors, *([integrator] if integrator else [])]
     ids = [part.id() for part in parts]
     everything = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
@@ -75,7 +80,10 @@ def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
 
 
 def changed_scene(scene, shapes=None, emitters=None) -> mi.Scene:
-    """Make a scene with other shapes or other top-level emitters. It shares all other objects with `scene`."""
+    """Make a scene with these shapes and these top-level emitters; None stands for those of `scene`.
+
+    The new scene shares all other objects with `scene`.
+    """
     shapes = scene.shapes() if shapes is None else shapes
     emitters = top_level_emitters(scene) if emitters is None else emitters
     return assembled(shapes, emitters, scene.sensors(), scene.integrator())
@@ -84,10 +92,11 @@ def changed_scene(scene, shapes=None, emitters=None) -> mi.Scene:
 def with_fitted_shape(
     scene: mi.Scene, shape: mi.Mesh, ring: RenderedObject, unit: float = 1.0
 ) -> tuple[mi.Scene, mi.Mesh]:
-    """Replace `shape` in a scene by a new shape with the BSDF and attributes of `ring`. Returns scene and new shape.
+    """Make a scene in which a new shape replaces `shape`. Returns (new scene, new shape).
 
-    Lengths of the shape are in units of `unit` scene units. It is a ball that contains the object, because Mitsuba
-    places distant emitters outside of a scene's bounding sphere when the scene is assembled.
+    The new shape has the BSDF of `ring` and the mesh attributes that this BSDF reads, but not yet the surface. It is a
+    ball that contains the object: when a scene is assembled, Mitsuba places distant emitters outside of the scene's
+    bounding sphere. `unit`: length of the unit of the new scene [scene units].
     """
     new = mi.load_dict({
         "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
@@ -109,7 +118,10 @@ def with_fitted_shape(
 
 
 def split_tables(scene) -> tuple[mi.Scene, mi.Scene | None]:
-    """Split a scene: without its `table` shapes, and of them alone; or the same scene and None if it has none."""
+    """Split a scene. Returns (scene without its `table` shapes, scene of these shapes only).
+
+    If there is no `table`, it returns (`scene`, None).
+    """
     tables = [shape for shape in scene.shapes() if is_table(shape)]
     if not tables:
         return scene, None
@@ -117,10 +129,10 @@ def split_tables(scene) -> tuple[mi.Scene, mi.Scene | None]:
 
 
 def has_table(scene) -> bool:
-    """Does a scene have a `table` shape?"""
+    """Test whether a scene has a `table` shape."""
     return any(is_table(shape) for shape in scene.shapes())
 
 
 def is_table(shape) -> bool:
-    """Is a shape a `table`, of any variant of Mitsuba?"""
+    """Test whether a shape is a `table`. This works for the classes of all variants of Mitsuba."""
     return getattr(shape, "of_tables", False)

@@ -1,4 +1,4 @@
-"""Point and directional lights, as numbers and as Mitsuba emitters; the emitters that light every photograph."""
+"""Point and directional lights, as numbers and as Mitsuba emitters, and tests for kinds of emitters."""
 
 from typing import Literal, NamedTuple
 
@@ -10,7 +10,7 @@ LAMP_CLASSES = "PointLight", "DirectionalEmitter"  #: Mitsuba's classes of emitt
 
 
 class Light(NamedTuple):
-    """A point light or distant light: that of one photograph, or a lamp, in the world."""
+    """A point light or a directional light, in world coordinates: the light of one photograph, or a lamp."""
 
     kind: Literal["point", "directional"]
     vector: np.ndarray  #: (3,) position [scene units], or direction in which the light travels
@@ -18,9 +18,10 @@ class Light(NamedTuple):
 
 
 def position_of(emitter):
-    """The position of an emitter and True, or the direction toward a distant emitter and False; attached.
+    """Find where an emitter is. Returns (position, True), or (unit direction toward it, False) if it is distant.
 
-    Returns None for other emitters, such as area lights and environment maps.
+    The vectors are attached to the emitter's parameters. Returns None for other emitters, such as area lights and
+    environment maps.
     """
     params = mi.traverse(emitter)
     match emitter.class_name():
@@ -35,14 +36,14 @@ def position_of(emitter):
 
 
 def light_of(emitter) -> Light:
-    """Convert a point light or directional light of Mitsuba to plain values."""
+    """Convert a point or directional emitter of Mitsuba to a light, which has plain numbers."""
     where, finite = position_of(emitter)
     vector, rgb = (np.array(dr.detach(part), float).ravel() for part in (where, strength_of(emitter)))
     return Light("point", vector, rgb) if finite else Light("directional", -vector, rgb)
 
 
 def emitter_of(light: Light) -> mi.Emitter:
-    """Convert a light to an emitter of Mitsuba."""
+    """Make a Mitsuba emitter from a light."""
     vector = light.vector.tolist()
     where = {"position": vector} if light.kind == "point" else {"direction": vector}
     strength = "intensity" if light.kind == "point" else "irradiance"
@@ -50,7 +51,11 @@ def emitter_of(light: Light) -> mi.Emitter:
 
 
 def move_lamp(emitter, place, strength) -> None:
-    """Set position, or unit direction toward it, and RGB strength of an emitter from `emitter_of`; may be attached."""
+    """Change an emitter from `emitter_of`, in place. The new values may be attached.
+
+    `place`: position of a point light, or unit direction toward a directional light. `strength`: RGB intensity, or
+    irradiance of a directional light.
+    """
     params = mi.traverse(emitter)
     if emitter.class_name() == "PointLight":
         params["position"], params["intensity.value"] = mi.Point3f(place), strength
@@ -63,24 +68,24 @@ def move_lamp(emitter, place, strength) -> None:
 
 
 def strength_of(emitter):
-    """The RGB intensity of a point light, or irradiance of a directional light; attached."""
+    """Return the RGB intensity of a point light, or the RGB irradiance of a directional light. It is attached."""
     name = "intensity.value" if emitter.class_name() == "PointLight" else "irradiance.value"
     return mi.Color3f(mi.traverse(emitter)[name])
 
 
 def shared_emitters(scene, rooms: bool = False) -> list:
-    """The emitters of a scene that light every photograph: all but `flash`, which is the light of one photograph.
+    """List the emitters of a scene that light every photograph. A `flash` is not listed: it is the light of one.
 
-    `rooms`: also the `room` emitters, whose light is in `Photographs.room`.
+    `rooms`: also list `room` emitters. By default they are left out, because their light is in `Photographs.room`.
     """
     return [e for e in scene.emitters() if not is_flash(e) and (rooms or not is_room(e))]
 
 
 def is_flash(emitter) -> bool:
-    """Is an emitter a `flash`, of any variant of Mitsuba?"""
+    """Test whether an emitter is a `flash`. This works for the classes of all variants of Mitsuba."""
     return getattr(emitter, "of_photographs", False)
 
 
 def is_room(emitter) -> bool:
-    """Is an emitter a `room`, of any variant of Mitsuba?"""
+    """Test whether an emitter is a `room`. This works for the classes of all variants of Mitsuba."""
     return getattr(emitter, "of_rooms", False)

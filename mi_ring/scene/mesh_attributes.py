@@ -1,4 +1,4 @@
-"""The textures of a BSDF, and the mesh attributes that it reads."""
+"""Finds the textures of a BSDF and the mesh attributes that the BSDF reads."""
 
 import re
 from collections.abc import Iterator
@@ -10,10 +10,10 @@ from mi_ring.errors import SceneError
 
 
 class Members(mi.TraversalCallback):
-    """Collects the named members of an object. `mi.traverse` keeps only numbers.
+    """Collects all named members of a Mitsuba object, in `found`. `mi.traverse` would collect only numbers.
 
-    This is no local class: Python frees those late, with the objects that they have seen, and Dr.Jit compiles every
-    BSDF in memory into the kernels of all scenes.
+    This class is not local to a function. Python frees a local class late, together with the objects that it has seen,
+    and Dr.Jit compiles every BSDF in memory into the kernels of all scenes.
     """
 
     def __init__(self, parent):
@@ -26,7 +26,7 @@ class Members(mi.TraversalCallback):
 
 
 def textures_of(bsdf) -> Iterator[tuple[str, mi.Texture]]:
-    """The textures of a BSDF or texture, and of all objects nested in it, each with its name."""
+    """Yield (name, texture) of all textures in a BSDF or texture, also in objects that are nested in it."""
     for name, value in Members(bsdf).found:
         if isinstance(value, mi.Texture):
             yield name, value
@@ -35,9 +35,9 @@ def textures_of(bsdf) -> Iterator[tuple[str, mi.Texture]]:
 
 
 def attribute_of(texture) -> str | None:
-    """The name of the mesh attribute that a texture reads; None for other kinds of textures.
+    """Return the name of the mesh attribute that a texture reads; None for a texture of another kind.
 
-    Raises SceneError if the name is not known.
+    Raises SceneError if the name cannot be found.
     """
     if texture.class_name() != "MeshAttribute":
         return None
@@ -48,7 +48,7 @@ def attribute_of(texture) -> str | None:
 
 
 def attributes_of(bsdf) -> set[str]:
-    """The names of the mesh attributes that a BSDF reads. Raises SceneError if they are not known."""
+    """Return the names of the mesh attributes that a BSDF reads. Raises SceneError if they cannot be found."""
     found = {name for _, texture in textures_of(bsdf) if (name := attribute_of(texture))}
     if not found and "MeshAttribute[" in str(bsdf):
         raise SceneError("bsdf: reads mesh attributes, but does not expose which; it cannot be used")
@@ -56,7 +56,7 @@ def attributes_of(bsdf) -> set[str]:
 
 
 def require_attributes(shape) -> None:
-    """Raise SceneError if a shape lacks a mesh attribute that its BSDF reads, or if its number of channels is wrong.
+    """Raise SceneError if a shape lacks a mesh attribute that its BSDF reads, or has one with a wrong channel count.
 
     Mitsuba would render such a shape black, without an error.
     """
@@ -75,7 +75,7 @@ def require_attributes(shape) -> None:
 
 
 def constant_values(bsdf) -> dict[str, list]:
-    """The values of a BSDF's constant textures by name. A name has several values where BSDFs are nested."""
+    """Return lists of the values of a BSDF's constant textures, by name. Nested BSDFs may give several values."""
     values = {}
     for key, value in mi.traverse(bsdf):
         head, _, tail = key.rpartition(".")

@@ -1,4 +1,4 @@
-"""Meshes of Mitsuba's own class."""
+"""Makes meshes of Mitsuba's own class."""
 
 import mitsuba as mi
 import numpy as np
@@ -8,7 +8,10 @@ POSITIONS, FACES = "vertex_positions", "faces"
 
 
 def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
-    """Make a mesh of vertices (V, 3) and faces (F, 3). `normals`: smooth ones? `uv` (V, 2): texture coordinates."""
+    """Make a mesh of vertices (V, 3) and faces (F, 3).
+
+    `normals`: the mesh gets smooth vertex normals. `uv` (V, 2): texture coordinates.
+    """
     mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=uv is not None)
     params = mi.traverse(mesh)
     params[POSITIONS] = mi.Float(np.asarray(vertices, np.float32).ravel())
@@ -20,5 +23,5 @@ def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
 
 
 def scene_of(vertices, faces) -> mi.Scene:
-    """Make a scene of one mesh with smooth normals: vertices (V, 3), faces (F, 3)."""
+    """Make a scene that contains one mesh, with smooth normals: vertices (V, 3), faces (F, 3)."""
     return mi.load_dict({"type": "scene", "mesh": mesh_of(vertices, faces)})

@@ -1,4 +1,4 @@
-"""Self-intersections of a mesh."""
+"""Finds self-intersections of a mesh."""
 
 import mitsuba as mi
 import numpy as np
@@ -9,10 +9,11 @@ HIT_OFFSET = 1e-6  #: step of a ray past a hit, for a mesh of size 1: more than 
 
 
 def crossing_triangles(vertices, faces) -> np.ndarray:
-    """Find triangles (F,) bool of a mesh that cross another triangle: vertices (V, 3), faces (F, 3), no seams.
+    """Find the triangles of a mesh that cross another triangle. Returns (F,) bool.
 
-    Two triangles cross if an edge of one pierces the other, so all edges are traced as rays. An edge does not pierce
-    triangles that contain one of its vertices. Triangles that overlap in one plane do not count.
+    The mesh, vertices (V, 3) and faces (F, 3), has no seams: neighbours share vertices. Two triangles cross if an edge
+    of one pierces the other. To find this, all edges are traced as rays. An edge does not pierce triangles that contain
+    one of its vertices. Triangles that overlap in one plane do not count.
     """
     vertices, faces = np.asarray(vertices, float), np.asarray(faces)
     low, high = vertices.min(0), vertices.max(0)

@@ -1,4 +1,4 @@
-"""A photograph's camera, light, response and files, without Mitsuba."""
+"""The camera, light, response and files of a photograph, as plain values without Mitsuba."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ Encoding: TypeAlias = Literal["auto", "srgb", "linear"]
 
 
 class Files(NamedTuple):
-    """The paths of the files of a photograph; None where it has no such file."""
+    """The paths of the files of a photograph. A path is None if the photograph has no such file."""
 
     filename: Path | None = None  #: the photograph
     mask: Path | None = None  #: 0 background, 255 object; equal to `filename` if the alpha channel is the mask
@@ -27,7 +27,7 @@ NO_FILES = Files()
 
 
 class Window(NamedTuple):
-    """A rectangle of a photograph, and the size to which it is reduced."""
+    """A rectangle of a photograph, and the size to which this rectangle is reduced."""
 
     corner: tuple[int, int]  #: first column and row [px of the photograph]
     extent: tuple[int, int]  #: width and height [px of the photograph]
@@ -36,12 +36,12 @@ class Window(NamedTuple):
 
     @property
     def scale(self) -> np.ndarray:
-        """How many pixels of the photograph make one reduced pixel, (2,): across and down."""
+        """Factors (2,) by which width and height of the rectangle are reduced."""
         return np.divide(self.extent, self.size)
 
     @property
     def blocks(self) -> int:
-        """Side of the squares of pixels that the first step of the reduction averages [px]."""
+        """Side of the square blocks of pixels that the first step of the reduction averages [px]."""
         blocks = int(self.scale.min())
         while any(side % blocks for side in self.extent):
             blocks -= 1
@@ -49,13 +49,13 @@ class Window(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Share of the photograph's area in the window."""
+        """Area of the rectangle divided by the area of the photograph."""
         return float(np.prod(self.extent) / np.prod(self.whole))
 
 
 @dataclass(frozen=True)
 class Response:
-    """How a camera records radiance. By default the file holds the radiance itself.
+    """How a camera records radiance. With the default values the recorded value is the radiance itself.
 
     The recorded linear value is `contrasted`((radiance · `gain` · cosine ^ `vignetting`) ^ `gamma`, `contrast`).
     """
@@ -68,16 +68,16 @@ class Response:
     def changed(
         self, gamma: float = 1.0, contrast: float = 1.0, vignetting: float = 0.0, gain: ArrayLike = 1.0
     ) -> "Response":
-        """A copy with `gamma`, `contrast` and `gain` multiplied by these values, and `vignetting` added."""
+        """Return a changed response: `gamma`, `contrast` and `gain` are factors, `vignetting` is added."""
         red, green, blue = np.multiply(self.gain, gain).tolist()
         return Response(self.gamma * gamma, self.contrast * contrast, self.vignetting + vignetting, (red, green, blue))
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A photograph of a capture: camera, light, response and files, as plain values.
+    """A photograph of a capture: camera, light, response and files, as plain values. It does not hold the pixels.
 
-    It is immutable; use `dataclasses.replace` for one with changed fields.
+    A shot cannot be changed. `dataclasses.replace` makes one with other fields.
     """
 
     name: str  #: the sensor's id in the scene file
@@ -92,7 +92,7 @@ class Shot:
     window: Window | None = None  #: the part of its files that it shows, with the camera of that part; None: all
 
     def through(self, window: Window) -> "Shot":
-        """Crop the photograph to a window, and reduce it."""
+        """Return this photograph, cropped to a window and reduced. The camera changes accordingly."""
         camera = self.camera
         camera = camera._replace(focal=camera.focal / window.scale, size=window.size,
                                  centre=(camera.centre - window.corner) / window.scale)  # fmt: skip
@@ -100,7 +100,7 @@ class Shot:
 
     @property
     def whole(self) -> "Shot":
-        """The whole photograph of this part: the inverse of `through`."""
+        """The photograph of which this shot is a part: the inverse of `through`. A whole photograph returns itself."""
         if self.window is None:
             return self
         camera, scale = self.camera, self.window.scale
@@ -110,7 +110,7 @@ class Shot:
 
     @property
     def frame(self) -> np.ndarray:
-        """The whole photograph's first and last corner, (2, 2), in the pixels of this part."""
+        """First and last corner (2, 2) of the whole photograph, in pixels of this part."""
         if self.window is None:
             return np.array([(0, 0), self.size])
         return (np.array([(0, 0), self.window.whole]) - self.window.corner) / self.window.scale
@@ -127,11 +127,14 @@ class Shot:
 
     @property
     def own_light(self) -> Light:
-        """The photograph's `light`. If that is None: a point light of intensity 1 at the camera."""
+        """The photograph's `light`. If `light` is None: a point light of intensity 1 at the camera."""
         return self.light or Light("point", self.camera.position, np.ones(3))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Shot":
-        """Move camera and light to another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        """Return this photograph with camera and light in another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
+
+        The intensity of a point light is scaled so that irradiances do not change.
+        """
         light = self.own_light
         if light.kind == "point":  # scaled so that irradiance does not change
             light = Light("point", scale * rotation @ light.vector + shift, scale**2 * light.rgb)

@@ -22,9 +22,9 @@ class MaskedCamera(NamedTuple):
 
 
 class Visibility:
-    """Tells which points of a mesh, vertices (V, 3) [scene units] and faces (F, 3), at least one camera sees.
+    """Tests which points of a mesh at least one camera sees. The mesh: vertices (V, 3) [scene units], faces (F, 3).
 
-    A camera sees a point that faces it, projects to a valid pixel, and is not hidden by the mesh.
+    A camera sees a point if the point faces the camera, projects to a valid pixel, and is not hidden by the mesh.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]) -> None:
@@ -38,11 +38,11 @@ class Visibility:
         self.views = list(dict(zip(keys, views)).values())
 
     def of_vertices(self) -> np.ndarray:
-        """Which vertices are seen, (V,) bool; their smooth normals say where they face."""
+        """Test which vertices are seen. Returns (V,) bool. Smooth normals decide whether a vertex faces a camera."""
         return self.of_points(self.vertices, np.array(mi.traverse(self.mesh)["vertex_normals"]).reshape(-1, 3))
 
     def of_points(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Which points (N, 3) [scene units] of the surface with unit normals (N, 3) are seen, (N,) bool."""
+        """Test which points (N, 3) [scene units] of the surface are seen. Returns (N,) bool. `normals` (N, 3): unit."""
         points, normals = np.asarray(points, float), np.asarray(normals, float)  # trimesh has arrays of its own
         seen = np.zeros(len(points), bool)
         start = (points - self.center) / self.size + SURFACE_OFFSET * normals
@@ -62,7 +62,7 @@ class Visibility:
 
 
 def in_picture(view: MaskedCamera, points: np.ndarray) -> np.ndarray:
-    """Which points (N, 3) [scene units] are in front of the camera and project to a valid pixel, (N,) bool."""
+    """Test which points (N, 3) [scene units] are in front of the camera and project to a valid pixel: (N,) bool."""
     pixels, depth = view.camera.project(points)
     inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < view.camera.size).all(1)
     if view.valid is not None:
@@ -74,9 +74,10 @@ def in_picture(view: MaskedCamera, points: np.ndarray) -> np.ndarray:
 def visible_points(
     ring: RenderedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]
 ) -> tuple[np.ndarray, float]:
-    """Find the vertices of a mesh of the domain that are seen on the object, (V,) bool, and the unseen share of area.
+    """Find which part of a fitted object the photographs show.
 
-    `s` (V, 3): the vertices in the domain; `faces` (F, 3).
+    Returns (which vertices are seen (V,) bool, share of the surface area that is not seen). `s` (V, 3), `faces` (F, 3):
+    a mesh of the domain of `ring`.
     """
     with torch.no_grad():
         vertices = ring.surface(torch.as_tensor(s, device=ring.center.device)).cpu().numpy()

@@ -1,4 +1,4 @@
-"""Makes Mitsuba objects of XML elements."""
+"""Loads XML elements as Mitsuba objects."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -8,7 +8,7 @@ from mi_ring.errors import InputError
 
 
 def require_parts(root: ElementTree.Element) -> None:
-    """Raise RuntimeError if an element lacks a part without which Mitsuba crashes."""
+    """Raise RuntimeError if an element in `root` lacks a part whose absence would crash Mitsuba."""
     for element in root.iter():
         if element.get("type") == "bitmap" and element.find("string[@name='filename']") is None:
             raise RuntimeError("bitmap: filename is missing")
@@ -17,7 +17,7 @@ def require_parts(root: ElementTree.Element) -> None:
 
 
 def load_element(element: ElementTree.Element) -> mi.Object:
-    """Load an element as a Mitsuba object. Raises RuntimeError if Mitsuba refuses it."""
+    """Load an XML element as a Mitsuba object. Raises RuntimeError if Mitsuba refuses the element."""
     require_parts(element)
     whole = ElementTree.Element(element.tag, element.attrib | {"version": "3.0.0"})
     whole.extend(element)
@@ -25,7 +25,7 @@ def load_element(element: ElementTree.Element) -> mi.Object:
 
 
 def load_bsdf(xml: str) -> mi.BSDF:
-    """Load the <bsdf> in a text of XML. Raises InputError if Mitsuba refuses it."""
+    """Load a <bsdf> element, given as a text of XML. Raises InputError if Mitsuba refuses the element."""
     try:
         return load_element(ElementTree.fromstring(xml))
     except (ElementTree.ParseError, RuntimeError) as error:

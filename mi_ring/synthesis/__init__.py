@@ -1,4 +1,4 @@
-"""Synthetic captures of known objects: scene, lights, cameras, path tracing by stock Mitsuba, and simulated errors.
+"""Makes synthetic captures of known objects: scene, lights and cameras, path tracing by Mitsuba, simulated errors.
 
 May import: mitsuba, drjit, numpy, scipy, trimesh, tyro; foreign, images, photogrammetry, capture, plugins,
 rendering, scene, geometry, system.

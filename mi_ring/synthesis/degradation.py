@@ -1,4 +1,4 @@
-"""Simulated errors: sensor noise, quantisation, varying exposure, wrong cameras and lights."""
+"""Simulates errors: sensor noise, quantisation, varying exposure, and wrong cameras and lights."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +17,11 @@ HALF_LIMIT = 6e4  #: radiance is clipped to this before it is written as half fl
 
 
 def with_noise(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
-    """Add noise to linear values: shot noise of `electrons` at full scale (0: none), and `read` noise [electrons]."""
+    """Return linear values with noise. 1 is full scale.
+
+    `electrons`: electrons at full scale, for shot noise; 0: no shot noise. `read`: standard deviation of the read noise
+    [electrons]; without shot noise, the unit is 1/10,000 of full scale.
+    """
     full = electrons or 10_000.0  # unit of read noise if there is no shot noise
     value = np.clip(linear, 0, NOISE_LIMIT) * full
     if electrons:
@@ -26,7 +30,7 @@ def with_noise(linear: np.ndarray, electrons: float, read: float, random: np.ran
 
 
 def encode(linear: np.ndarray, kind: Format) -> np.ndarray:
-    """Encode linear pixels (H, W, 3): linear half floats (exr), linear 16 bits (png16) or 8-bit sRGB (png8)."""
+    """Encode linear pixels (H, W, 3) as linear half floats (exr), linear 16 bits (png16) or 8-bit sRGB (png8)."""
     if kind == "exr":
         return np.clip(linear, 0, HALF_LIMIT).astype(np.float16)
     if kind == "png16":
@@ -35,7 +39,11 @@ def encode(linear: np.ndarray, kind: Format) -> np.ndarray:
 
 
 def exposures(count: int, spread: float, random: np.random.Generator) -> np.ndarray:
-    """Draw lognormal factors (count, 3) with standard deviation `spread` [%], plus a third of it for each channel."""
+    """Draw random factors (count, 3) of the exposure of each photograph and colour.
+
+    They are lognormal. `spread`: standard deviation of the factor that the colours share [%]; the factor of a single
+    colour has a third of it.
+    """
     return np.exp(random.normal(0, spread / 100, (count, 1)) + random.normal(0, spread / 300, (count, 3)))
 
 
@@ -43,11 +51,12 @@ def miscalibrated(
     shots: Sequence[Shot], center: np.ndarray, random: np.random.Generator, turned: float = 0.0, shifted: float = 0.0,
     scaled: float = 0.0,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """Add random errors to cameras and lights. Distances are those from the camera to `center` (3,).
+    """Return the photographs with random errors of cameras and lights.
 
-    `turned`: standard deviation of a camera's rotation about each axis [deg] and of its translation along each axis [%
-    of the distance]; its flash moves with it. `shifted`: translation of all point lights [% of the distance], in one
-    direction in the camera's axes. `scaled`: standard deviation of a lognormal factor of a light's power [%].
+    Distances below are from the camera to `center` (3,). `turned`: standard deviation of a camera's rotation about each
+    axis [deg] and of its translation along each axis [% of the distance]; the flash moves with the camera. `shifted`:
+    translation of each point light [% of the distance]; its direction in the camera's axes is the same for all.
+    `scaled`: standard deviation of a lognormal factor of each light's intensity [%].
     """
     wrong = []
     direction = random.normal(size=3)

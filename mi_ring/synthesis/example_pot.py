@@ -1,4 +1,4 @@
-"""The example capture: flash photographs of a pot, path traced by stock Mitsuba."""
+"""Makes the example capture: flash photographs of a pot, path traced by Mitsuba."""
 
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -34,19 +34,22 @@ PROFILE = np.array([
 
 
 class ColouredMesh(NamedTuple):
-    """A mesh with linear colours of its vertices."""
+    """A mesh whose vertices have colours. The colours are linear."""
 
     vertices: np.ndarray  #: (V, 3) [mm]
     faces: np.ndarray  #: (F, 3)
     colours: np.ndarray  #: (V, 3)
 
     def ply(self) -> bytes:
-        """Write the mesh as a PLY file, without colours."""
+        """Return the mesh as the bytes of a PLY file, without colours."""
         return cast(bytes, trimesh.Trimesh(self.vertices, self.faces, process=False).export(file_type="ply"))
 
 
 def pot(level: int = 6) -> ColouredMesh:
-    """Make a closed pot: `PROFILE` rotated about y, fluted, flattened, sheared. `level`: subdivisions of the sphere."""
+    """Make the closed mesh of a pot: `PROFILE` is rotated about y, and the result is fluted, flattened and sheared.
+
+    `level`: level of the icosphere whose vertices the mesh has.
+    """
     sphere = trimesh.creation.icosphere(subdivisions=level)
     x, y, z = sphere.vertices.T
     t, angle = np.arccos(np.clip(-y, -1, 1)) / np.pi, np.arctan2(z, x)  # position along the profile, and around y
@@ -76,7 +79,10 @@ def cameras() -> list[Camera]:
 
 
 def write_example(folder: Path, spp: int = SPP) -> None:
-    """Write scene.xml, images/, masks/ and truth/mesh.ply into an existing folder."""
+    """Render the example capture. Writes scene.xml, images/, masks/ and truth/mesh.ply into an existing folder.
+
+    `spp`: light paths per pixel.
+    """
     vertices, faces, colours = pot()
     mesh = mesh_of(vertices, faces)
     mesh.add_attribute("vertex_color", 3, colours.ravel().tolist())

@@ -1,4 +1,4 @@
-"""Lights of a synthetic capture: one per photograph, further lamps, and the room."""
+"""Makes the lights of a synthetic capture: one per photograph, further lamps, and the room."""
 
 from typing import Literal
 
@@ -22,11 +22,12 @@ def lights_of(
     kind: LightKind, cameras: list[Camera], offset: tuple[float, float, float], spread: float,
     random: np.random.Generator, distance: float = 1.0,
 ) -> list[Light]:  # fmt: skip
-    """Place a light for each camera. The median irradiance of a surface at the origin that faces its light is 1 W/m².
+    """Place a light of this `kind` for each camera. Returns one light per camera.
 
-    All point lights have one intensity. `offset`: of a flash from the lens, left, up and forward [distance of the
-    camera from the origin]. `spread`: largest angle between a camera and its point or distant light, seen from the
-    origin [deg]. `distance`: of a lamp from the origin; it is in one place for all photographs.
+    The median irradiance of a surface at the origin that faces its light is 1 W/m². All point lights have the same
+    intensity. `offset`: for a flash, its position relative to the lens: left, up and forward [distance from the camera
+    to the origin]. `spread`: for a point or distant light, its largest angle to the camera, seen from the origin [deg].
+    `distance`: for a lamp, its distance from the origin; the lamp has the same place for all cameras.
     """
     if kind == "flash":
         places = [c.position + np.linalg.norm(c.position) * c.to_world[:3, :3] @ offset for c in cameras]
@@ -42,7 +43,10 @@ def lights_of(
 
 
 def further_lamps(count: int, first: Light, random: np.random.Generator) -> list[Light]:
-    """Place `count` lamps as far from the origin as the `first` one, in other directions, weaker, of other colours."""
+    """Place `count` lamps in addition to the lamp `first`. Returns them.
+
+    They are as far from the origin as `first`, in other directions, weaker, and of other colours.
+    """
     distance, directions = np.linalg.norm(first.vector), [first.vector / np.linalg.norm(first.vector)]
     lights = []
     for _ in range(count):
@@ -55,7 +59,7 @@ def further_lamps(count: int, first: Light, random: np.random.Generator) -> list
 
 
 def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
-    """Rotate `position` (3,) about the origin by a random angle up to `spread` [rad] in a random direction."""
+    """Rotate `position` (3,) about the origin, by a random angle of at most `spread` [rad], in a random direction."""
     cosine, turn = random.uniform(np.cos(spread), 1), random.uniform(0, 2 * np.pi)
     axis = position / np.linalg.norm(position)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -65,7 +69,10 @@ def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Gener
 
 
 def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.ndarray:
-    """Draw spherical harmonics (BASIS, 3) of a room's radiance, mean about 1. `in_camera`: fixed to the camera?"""
+    """Draw the light of a random room: spherical harmonics (BASIS, 3) of its radiance, whose mean is about 1.
+
+    `in_camera`: the light is fixed to the camera; otherwise it is fixed in the world.
+    """
     colour = 1 + TINT * random.uniform(-1, 1, 3)
     room = np.zeros((BASIS, 3))
     room[0] = colour * np.sqrt(4 * np.pi)  # the first harmonic is 1 / sqrt(4 pi)

@@ -1,4 +1,4 @@
-"""Materials of the object: any Mitsuba BSDF, a measured BRDF, or two of these in a pattern."""
+"""Makes the material of the object: any Mitsuba BSDF, a measured BRDF, or two of these in a pattern."""
 
 import re
 import shlex
@@ -23,23 +23,24 @@ FORMS = "a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, or a
 
 
 class Pattern(NamedTuple):
-    """A texture that says where a surface has the second of two materials. It is projected along one axis."""
+    """A texture that says where a surface has the second of two materials."""
 
     weights: np.ndarray  #: (rows, columns) share of the second material; the texture repeats
     uv: np.ndarray  #: (V, 2) texture coordinates of the vertices
 
     def blend(self, first: mi.BSDF, second: mi.BSDF) -> mi.BSDF:
-        """Blend two BSDFs by this texture: `second` where it is bright."""
+        """Make a BSDF that is `second` where this texture is 1, and `first` where it is 0."""
         pixels = mi.Bitmap(np.ascontiguousarray(self.weights[..., None], np.float32))
         nearest = {"type": "bitmap", "bitmap": pixels, "raw": True, "filter_type": "nearest", "wrap_mode": "repeat"}
         return mi.load_dict({"type": "blendbsdf", "weight": nearest, "bsdf_0": first, "bsdf_1": second})
 
 
 def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str) -> Pattern:
-    """Make the pattern on vertices (V, 3). `kind`: "stripes", "checks", or an image file whose bright pixels are used.
+    """Make the pattern for an object with these `vertices` (V, 3).
 
-    `bands`: number of stripes or checks along the axis `up` (0, 1 or 2). Texture coordinates are linear in space, so
-    that edges are sharp on coarse meshes. Raises InputError, which names the `field`, if the image cannot be read.
+    `kind`: "stripes", "checks", or an image file: the second material is where the image is bright. `bands`: number of
+    stripes or checks along the axis `up` (0, 1 or 2). The pattern is projected along an axis, so that its edges are
+    sharp on coarse meshes, too. Raises InputError, which names the `field`, if the image cannot be read.
     """
     low, high = vertices.min(0), vertices.max(0)
     across, height = (up + 1) % 3 if up != 1 else 0, max(high[up] - low[up], 1e-9)
@@ -58,7 +59,10 @@ def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str)
 
 
 def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
-    """Make the BSDF for a text in one of the `FORMS`. `coloured`: does the mesh have colours? Raises InputError."""
+    """Make the BSDF that `text` describes in one of the `FORMS`. `coloured`: the mesh has colours.
+
+    Raises InputError, which names the `field`, if that is impossible.
+    """
     file, _, name = text.partition(".npz:")
     path = Path(f"{file}.npz" if name else text)
     found: Any = None
@@ -88,7 +92,7 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
 
 
 def explain(message: str) -> str:
-    """Rewrite a message of Mitsuba about a plugin or its parameters for users of the command."""
+    """Rewrite an error message of Mitsuba about a plugin or its parameters, for the user of the command."""
     if unknown := re.findall(r"^ *- \w+ \"([^\"]*)\":", message, re.M):
         return f"has no parameter {' and '.join(unknown)}; Mitsuba's documentation lists those of each plugin"
     if kind := re.search(r"Plugin \"(.*?)\" not found", message):
@@ -100,7 +104,10 @@ def explain(message: str) -> str:
 
 
 def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
-    """Parse a text like `principled base_color=0.6,0.2,0.1 roughness=0.3` to a dictionary for `mi.load_dict`."""
+    """Parse a text like `principled base_color=0.6,0.2,0.1 roughness=0.3`. Returns a dictionary for `mi.load_dict`.
+
+    `coloured`: the mesh has colours. Raises InputError, which names the `field`, if the text is invalid.
+    """
     try:
         name, *words = shlex.split(text)
     except ValueError as error:
@@ -119,7 +126,10 @@ def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
 
 
 def parse_value(value: str) -> Any:
-    """Parse the value of a parameter: a number, a colour R,G,B, true or false, the colours of the mesh, or a string."""
+    """Parse the value of a parameter for `mi.load_dict`.
+
+    It is a number, a colour R,G,B, true or false, vertex_color (the colours of the mesh), or any other string.
+    """
     if value == COLOURS:
         return {"type": "mesh_attribute", "name": COLOURS}
     if value in ("true", "false"):

@@ -1,4 +1,4 @@
-"""The object of a synthetic capture, its table, and their images under one light."""
+"""The object of a synthetic capture and its table. Renders them under one light."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -29,21 +29,25 @@ DOTS_PER_PIXEL = 3  #: dots of the printed page per pixel of the sheet's texture
 
 
 class ObjectOnTable:
-    """An object with its BSDF, and the shapes on which it stands."""
+    """An object with its BSDF, and the table on which it stands."""
 
     def __init__(self, mesh: mi.Mesh, vertices: np.ndarray, tables: Iterable[mi.Object] = ()) -> None:
-        """Join object and tables. `vertices` (V, 3): of the object; without tables, only its pixels are rendered."""
+        """Join the object `mesh` and the shapes of the table. `vertices` (V, 3): the vertices of the object."""
         self.object, self.vertices, self.tables = mesh, vertices, list(tables)
 
     def under(self, emitter: mi.Object) -> mi.Scene:
-        """Make the scene with this emitter only."""
+        """Make the scene of object and table with this emitter as the only light."""
         shapes = {f"shape{k}": shape for k, shape in enumerate([self.object, *self.tables])}
         return mi.load_dict({"type": "scene", **shapes, "lamp": emitter}, optimize=False)
 
     def radiance(
         self, view: LensCamera, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
     ) -> np.ndarray:
-        """Render linear radiance (H, W, 3) under one light. `hidden`: an environment map is not visible."""
+        """Render linear radiance (H, W, 3) under one light.
+
+        `spp`: paths per pixel. `depth`: largest length of paths. `hidden`: an environment map is invisible to the
+        camera; then, without a table, pixels away from the object are 0.
+        """
         trace: Any = partial(radiance_along, depth=depth, hidden=hidden)
         if isinstance(light, Light):
             middle = (self.vertices.min(0) + self.vertices.max(0)) / 2
@@ -55,16 +59,17 @@ class ObjectOnTable:
         return pixel_means(partial(trace, scene=self.under(light)), view, window, spp, seed)
 
     def coverage(self, view: LensCamera, spp: int = 64) -> np.ndarray:
-        """Render the share of each pixel that shows the object, (H, W)."""
+        """Render the coverage (H, W): the share of each pixel that shows the object."""
         trace = partial(hits_along, scene=self.under(mi.load_dict({"type": "constant"})), shape=self.object)
         return pixel_means(trace, view, view.around(self.vertices), spp, 0)[..., 0]
 
 
 def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimesh, np.ndarray | None, np.ndarray]:
-    """Read a mesh. Moves the middle of its bounding box to the origin, and scales its farthest vertex to `radius`.
+    """Read a mesh file. Returns (mesh, linear colours of its vertices (V, 3) or None, transform (4, 4)).
 
-    Returns the mesh, its linear colours (V, 3) or None, and the matrix (4, 4) of that motion. `smooth`: Loop
-    subdivision to at least `SMOOTH` vertices. Raises InputError if the file has no surface.
+    The transform has been applied: it moves the middle of the bounding box to the origin and scales the distance of the
+    farthest vertex to `radius`. `smooth`: subdivide the mesh by Loop's rule to at least `SMOOTH` vertices. Raises
+    InputError if the file has no surface or cannot be subdivided.
     """
     mesh = read_mesh(path, "MESH")
     mesh.remove_unreferenced_vertices()
@@ -98,7 +103,11 @@ def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimes
 
 
 def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, pattern: Pattern | None) -> mi.Mesh:
-    """Make the object a Mitsuba shape with smooth normals. `colours`: (V, 3) linear, or None."""
+    """Make a Mitsuba shape of the object, with smooth normals and this BSDF.
+
+    `colours` (V, 3): linear colours of the vertices; None: no colours. `pattern`: gives the texture coordinates; None:
+    no texture coordinates.
+    """
     shape = mesh_of(mesh.vertices, mesh.faces, uv=None if pattern is None else pattern.uv)
     if colours is not None:
         shape.add_attribute(COLOURS, 3, colours.ravel().tolist())
@@ -107,7 +116,11 @@ def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, p
 
 
 def table_elements(folder: Path, ground: np.ndarray, up: np.ndarray, radius: float, sheet: bool) -> list[Element]:
-    """Write XML of a table at `ground` (3,) with normal `up` (3,), and of the `sheet` on it; and their textures."""
+    """Make the XML elements of a table, and write their textures to `folder`.
+
+    `ground` (3,): a point of the table. `up` (3,): normal of the table. `radius`: radius of the object. `sheet`: put
+    the printed sheet of mi-ring board on the table; it is a second element.
+    """
     right = np.roll(up, 1)
     pictures = {"table": (np.broadcast_to(WOOD, (2, 2, 3)), np.full(2, TABLE * radius / 2), BELOW * radius)}
     if sheet:

@@ -20,11 +20,11 @@ class SynthesizeConfig:
     The middle of the mesh's bounding box is moved to the origin, and its farthest vertex is scaled to --radius. The
     mesh is not rotated.
 
-    A material is one of these: a file .xml with one <bsdf>; a table .binary of MERL; FILE.npz:MATERIAL, networks fitted
-    to such tables; or a Mitsuba plugin with its parameters, as in "principled base_color=0.6,0.2,0.1 roughness=0.3".
-    The value vertex_color means the colours in the mesh's file.
+    A material is one of these: an .xml file with one <bsdf>; a .binary file of the MERL database; FILE.npz:MATERIAL, a
+    network fitted to such a file; or a Mitsuba plugin with its parameters, as in "principled base_color=0.6,0.2,0.1
+    roughness=0.3". The value vertex_color stands for the colours in the file of the mesh.
 
-    After an interruption the same command continues.
+    After an interruption, give the same command again: it continues.
     """
 
     mesh: Positional[Annotated[Path, arg(metavar="MESH")]]
@@ -33,82 +33,94 @@ class SynthesizeConfig:
     """Folder to write."""
 
     material: str | None = None
-    """Material of the object, for example "principled base_color=0.6,0.2,0.1 roughness=0.3". All forms: see above.
-    Without it: principled, with the colours of the mesh file, or with one colour if the file has none."""
+    """Material of the object, for example "principled base_color=0.6,0.2,0.1 roughness=0.3". The description of the
+    command lists all forms. Without this option: principled, with the colours of the mesh file, or with one colour if
+    the file has no colours."""
     second: str | None = None
-    """Second material, in one of the forms above; --pattern says where it is. Without it: a single material."""
+    """Second material, in one of the forms of --material. --pattern says where on the object it is.
+    Without this option the object has a single material."""
     pattern: Annotated[str, arg(metavar="stripes|checks|PICTURE")] = "stripes"
-    """Where on the object the second material is.
+    """Where on the object the second material is. Only with --second.
     stripes: in stripes across the object. checks: in a checkerboard.
-    PICTURE: where this picture is bright, projected onto the object from the front."""
+    PICTURE: where an image file is bright. The image is projected onto the object from the front."""
     bands: int = 8
     """Number of stripes or checks from the bottom of the object to its top, 1 to 1000. Only with --second."""
     smooth: bool = False
-    """Subdivide the mesh by Loop's rule until it has 10,000 vertices. Use it for coarse meshes of round objects."""
+    """Subdivide the mesh by Loop's rule until it has at least 10,000 vertices.
+    Use this option for coarse meshes of round objects."""
     radius: float = 50.0
     """Distance of the object's farthest vertex from its middle, after scaling [scene units].
     With the printed sheet the unit is the millimetre."""
     up: Literal["x", "y", "z"] = "y"
-    """Axis of the mesh that points up. Turntable, table and environment depend on it."""
+    """Axis of the mesh that points up. It is the axis of the turntable, the normal of the table and the direction to
+    the top of the environment map."""
 
     views: int = 50
-    """Number of photographs for the fit. More show more of the object and take longer."""
+    """Number of photographs for the fit. More photographs show more of the object and take longer to render."""
     novel: int = 10
     """Number of further photographs, in truth/images, to test a fit with. 0: none.
-    They are from other viewpoints, without noise and errors."""
+    These photographs have other viewpoints, no noise and exact calibration."""
     size: tuple[int, int] = (512, 512)
     """Width and height of the photographs [px]."""
     fov: float = 60.0
     """Horizontal field of view of the cameras [deg], 1 to 150."""
     cameras: CameraKind = "around"
     """Where the cameras are.
-    around: evenly around the object, aimed at its middle. free: as if hand-held, tilted, at varying distances.
+    around: evenly around the object, aimed at its middle.
+    free: as if hand-held: at random places and varying distances, and tilted.
     turntable: the object turns, while the camera and the light of --room stand still."""
     elevations: tuple[float, ...] = (20.0, 55.0)
-    """Angle of the cameras above the plane of the turntable [deg]: one number for each ring of cameras, -89 to 89.
+    """Angles of the cameras above the plane of the turntable [deg]: one number for each ring of cameras, -89 to 89.
     20 55: two rings. Only for --cameras turntable."""
     distance: float | None = None
-    """Distance of the cameras from the middle of the object, 1.05 to 1000. 3: three times --radius.
-    Without it: the object just fills the photograph."""
+    """Distance of the cameras from the middle of the object [--radius], 1.05 to 1000. 3: three times --radius.
+    Without this option: the object just fills the photograph."""
 
     light: LightKind = "flash"
     """The light in each photograph.
-    flash: a point light at the lens, or at --offset from it. distant: parallel light.
-    point: a point light elsewhere, as far from the object as the camera. lamp: one point light for all photographs."""
+    flash: a point light at the lens, or beside the lens by --offset.
+    point: a point light elsewhere, in another place for each photograph, as far from the object as the camera.
+    distant: parallel light, from another direction for each photograph.
+    lamp: a point light that is in the same place for all photographs."""
     lamps: int = 1
-    """Number of lamps for --light lamp, 1 to 8.
-    The first lamp is the photographs' light; the other lamps are emitters of the scene."""
+    """Number of lamps that shine in all photographs, 1 to 8. Only with --light lamp.
+    Give 2 or more to test fits with --light lamps or --refine lamps. In the scene file, the first lamp is the light in
+    each <sensor>, and the other lamps are emitters outside <sensor>."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the flash relative to the lens: left, up and forward [distance from the camera to the object].
-    0.1 0.2 0: to the left by a tenth of this distance and up by a fifth."""
+    0.1 0.2 0: to the left by a tenth of this distance and up by a fifth of it. Only for --light flash."""
     spread: float = 40.0
-    """Largest angle between camera and light, seen from the object [deg], 0 to 80; for --light point and distant."""
+    """Largest angle between camera and light, seen from the object [deg], 0 to 80.
+    Only for --light point and distant."""
     room: float = 0.0
     """Strength of additional light from all sides, as in a room that is not dark, 0 to 10. 0: none.
-    1: on a surface that faces --light, both are equally strong. Give 0.05 to 0.2 to test fits of such photographs."""
+    1: a surface that faces the light of --light gets equally much light from the room. Give 0.05 to 0.2 to test fits of
+    photographs from a room that is not dark."""
     room_kind: RoomKind = "constant"
-    """From where the light of --room comes.
-    constant: the same from all sides. harmonics: brighter from some sides, by spherical harmonics of order 2."""
+    """How the light of --room depends on the direction.
+    constant: the same from all sides. harmonics: stronger from some sides, by spherical harmonics of order 2."""
     pairs: bool = False
-    """Render each view a second time, under the light of --room alone.
-    The scene file names these second photographs (`ambient`), and a fit subtracts them."""
+    """Render each view a second time, under the light of --room alone. A fit subtracts these second photographs.
+    The scene file names them as `ambient`."""
     environment: Path | None = None
     """EXR or HDR file of an environment map (latitude, longitude). It replaces the lights of --light and --room."""
     table: Literal["none", "plain", "sheet"] = "none"
-    """Table below the object, which hides its underside from cameras and reflects light.
-    none: no table. plain: a plain table. sheet: a table with the sheet of mi-ring board; --radius is in millimetres."""
+    """Put a table below the object. The table hides the underside of the object and reflects light onto the object.
+    none: no table. plain: a table of one colour. sheet: a table with the sheet of mi-ring board on it. With sheet,
+    --radius is in millimetres."""
 
     format: Format = "exr"
     """Format of the photographs.
     exr: linear, half precision. png16: linear, 16 bits. png8: sRGB, 8 bits, like those of most cameras."""
     exposure: float | None = None
-    """Brightness of the photographs: linear pixel value of a white surface at the object that faces the light.
-    1: such a surface just reaches full scale. Without it: --clipped determines the brightness."""
+    """Brightness of the photographs: the linear pixel value of a white surface that faces the light at the object.
+    1: such a surface just reaches full scale. Without this option, --clipped determines the brightness."""
     clipped: float = 0.02
-    """Choose the exposure so that this share of the object's pixels is overexposed, 0 to 0.9. 0.02: 2 % of them.
-    It is not used with --exposure."""
+    """Choose the exposure so that this share of the object's pixels is overexposed, 0 to 0.9. 0.02: 2 % of the pixels.
+    Do not give it together with --exposure."""
     electrons: float = 0.0
-    """Electrons that a pixel counts at full scale, for example 10000. Fewer give more shot noise. 0: no shot noise."""
+    """Electrons that a pixel counts at full scale, for example 10000. Fewer electrons give more shot noise.
+    0: no shot noise."""
     read: float = 0.0
     """Standard deviation of the read noise, the same for all pixels [electrons], for example 10. 0: no read noise.
     Without --electrons the unit is 1/10,000 of full scale."""
@@ -118,16 +130,18 @@ class SynthesizeConfig:
     1: each camera turns by 1 degree about each axis and moves by 1 % of its distance along each axis. These numbers
     are standard deviations."""
     wrong_light: float = 0.0
-    """Distance by which the scene file misplaces point lights [% of the camera's distance], for example 2. 0: exact.
-    It misplaces all lights in the same direction relative to their cameras. Use it to test --refine light."""
+    """Error of the positions of point lights in the scene file [% of the camera's distance], for example 2. 0: exact.
+    The error has the same direction relative to each camera. Use this option to test --refine light."""
     wrong_power: float = 0.0
-    """Random errors of the powers of the lights in the scene file: their standard deviation [%], for example 10.
-    0: exact powers. Use it to test --refine power."""
+    """Random errors of the intensities of the lights in the scene file: their standard deviation [%], for example 10.
+    0: exact intensities. Use this option to test --refine power."""
     wrong_exposure: float = 0.0
     """Random differences of exposure between photographs: their standard deviation [%], for example 10. 0: none.
-    The white balance varies by a third of it. The scene file says neither. Use it to test --refine gain."""
+    The white balance varies by a third of this number. The scene file does not say how exposure and white balance vary.
+    Use this option to test --refine gain."""
     wrong_room: bool = False
-    """Leave --room, --environment and further --lamps out of the scene file, to test fits in unknown light."""
+    """Leave these lights out of the scene file, to test fits in unknown light: the room, the environment, and all lamps
+    but the first."""
 
     spp: int = 64
     """Light paths per pixel, rounded up to a square number. More paths give less noise and take longer."""
@@ -139,13 +153,13 @@ class SynthesizeConfig:
 
     @property
     def exact(self) -> bool:
-        """Is the calibration in the scene file exact: no --wrong-… is given?"""
+        """Is the calibration in the scene file exact? It is not if an option --wrong-… changes it."""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
     def up_axis(self) -> np.ndarray:
-        """The unit vector (3,) that points up."""
+        """Unit vector (3,) that points up."""
         return np.eye(3)["xyz".index(self.up)]
 
     @property

@@ -1,4 +1,4 @@
-"""Path traces a synthetic capture of a known object: photographs, masks, scene file, and ground truth."""
+"""Path traces a synthetic capture of a known object: photographs, masks, scene file and ground truth."""
 
 import hashlib
 import json
@@ -46,7 +46,7 @@ REFERENCES = {
 
 
 class PlannedPhotograph(NamedTuple):
-    """A photograph that is to be rendered: camera, light, files and random seed."""
+    """A photograph that will be rendered: camera, light, names and random seed."""
 
     camera: Camera
     light: Light  #: brings 1 W/m² to the object
@@ -56,7 +56,10 @@ class PlannedPhotograph(NamedTuple):
 
 
 class Studio:
-    """The object, lights, room and cameras that the options describe. Raises InputError if a file cannot be read."""
+    """The object, lights, room and cameras that the options describe, and functions that render them.
+
+    Raises InputError if a file cannot be read.
+    """
 
     def __init__(self, config: SynthesizeConfig) -> None:
         self.config = config
@@ -76,16 +79,22 @@ class Studio:
         self.gains = exposures(config.views, config.wrong_exposure, self.random(6))  #: (views, 3)
 
     def random(self, *purpose: int) -> np.random.Generator:
-        """A random generator for one purpose, so that an option does not change the random numbers of others."""
+        """Make a random generator for one purpose. `purpose`: any integers.
+
+        Each purpose has its own generator, so that an option does not change random numbers for another purpose.
+        """
         return np.random.default_rng([self.config.seed, *purpose])
 
     @property
     def ground(self) -> np.ndarray:
-        """The point (3,) on the vertical axis through the origin that is as low as the object's lowest point."""
+        """Point (3,) of the table: on the vertical axis through the origin, as low as the object's lowest point."""
         return self.config.up_axis * (self.mesh.vertices @ self.config.up_axis).min()
 
     def photographs(self, count: int, novel: bool = False) -> list[PlannedPhotograph]:
-        """Plan `count` photographs. `novel`: by a hand-held camera, from other viewpoints."""
+        """Plan `count` photographs: cameras, lights, names and seeds. Renders nothing.
+
+        `novel`: photographs to test a fit with, from the viewpoints of a hand-held camera.
+        """
         config = self.config
         pose = poses("free" if novel else config.cameras, count, config.radius, config.camera_distance, config.up_axis,
                      self.random(2, novel), config.elevations, config.table != "none")  # fmt: skip
@@ -100,11 +109,14 @@ class Studio:
                 for k, (camera, light) in enumerate(zip(cameras, lights))]  # fmt: skip
 
     def further_lamps(self, first: Light) -> list[Light]:
-        """All lamps but the `first`, which is the photographs' own light."""
+        """Make all lamps except the `first` lamp, which is the own light of each photograph."""
         return light_sources.further_lamps(self.config.lamps - 1, first, self.random(8))
 
     def environment_element(self, scale: float = 1.0) -> Element:
-        """The environment as XML. Raises InputError if its file cannot be read."""
+        """Make the XML of the environment map. `scale`: factor of its radiance.
+
+        Raises InputError if its file cannot be read.
+        """
         file = Path(str(self.config.environment)).resolve()
         element = ElementTree.Element("emitter", type="envmap")
         ElementTree.SubElement(element, "string", name="filename", value=str(file))
@@ -119,7 +131,7 @@ class Studio:
         return element
 
     def build(self, folder: Path) -> ObjectOnTable:
-        """The object and its table, whose textures are written to the `folder`."""
+        """Make the object and its table. Writes the textures of the table to `folder`."""
         config, shapes = self.config, []
         if config.table != "none":
             self.tables = table_elements(folder, self.ground, config.up_axis, config.radius, config.table == "sheet")
@@ -129,7 +141,11 @@ class Studio:
         return ObjectOnTable(self.shape, self.mesh.vertices, shapes)
 
     def radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """Render linear radiance (H, W, 3) under all lamps, the first of 1 W/m². `scale`: how much smaller."""
+        """Render a photograph under all lamps, or under the environment, but not under the room's light.
+
+        Returns linear radiance (H, W, 3). The first lamp brings 1 W/m² to the object. `spp`: paths per pixel. `scale`:
+        how many times smaller the picture is.
+        """
         depth, view = self.config.depth, LensCamera(taken.camera.shrunk(scale))
         light = taken.light if self.environment is None else load_element(self.environment)
         picture = scene.radiance(view, light, spp, taken.seed, depth, hidden=self.environment is None)
@@ -138,7 +154,10 @@ class Studio:
         return picture
 
     def room_radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """Render linear radiance (H, W, 3) under the room's light alone. Arguments: those of `radiance`."""
+        """Render a photograph under the room's light alone. Returns linear radiance (H, W, 3).
+
+        Arguments: as for `radiance`.
+        """
         view = LensCamera(taken.camera.shrunk(scale))
         if not self.config.room:
             return np.zeros((*reversed(view.camera.size), 3))
@@ -147,7 +166,11 @@ class Studio:
         return scene.radiance(view, light, spp, taken.seed + 1, self.config.depth)
 
     def exposure(self, scene: ObjectOnTable, photographs: list[PlannedPhotograph]) -> float:
-        """Choose the pixel value of radiance 1: by --exposure, or so that the share --clipped is overexposed."""
+        """Choose the pixel value of radiance 1: from --exposure, or so that the share --clipped is overexposed.
+
+        For --clipped, it renders some photographs in small size. Raises InputError if no pixel shows only the object,
+        or if the object is black.
+        """
         config = self.config
         if config.exposure is not None:
             return config.exposure * (1.0 if self.environment is not None else np.pi)
@@ -166,7 +189,11 @@ class Studio:
 
 
 def write_capture(config: SynthesizeConfig) -> None:
-    """Write the capture that the options describe, or its missing part; the scene file last. May raise InputError."""
+    """Write the capture that the options describe. Photographs that exist are not rendered again.
+
+    The scene file is written last. Raises InputError if the folder contains anything else, or if a file cannot be read
+    or written.
+    """
     out, studio = config.out, Studio(config)
     claim(out, config)
     for name in ("truth/images", "truth/masks", "images", "masks", *["ambient"] * config.pairs):
@@ -204,7 +231,11 @@ def write_capture(config: SynthesizeConfig) -> None:
 def write_scenes(
     studio: Studio, seen: list[PlannedPhotograph], novel: list[PlannedPhotograph], exposure: float
 ) -> None:
-    """Write scene.xml, truth/scene.xml of the novel views, and, if scene.xml has errors, truth/exact.xml without."""
+    """Write scene.xml of the photographs `seen` and truth/scene.xml of the photographs `novel`.
+
+    If scene.xml has simulated errors, also write truth/exact.xml: the same without errors. `exposure`: pixel value of
+    radiance 1.
+    """
     config, out = studio.config, studio.config.out
     strength = exposure if studio.environment is None else 0.0
     emitters: list[Element] = []
@@ -250,7 +281,7 @@ def write_scenes(
 
 
 def digest(file: Path) -> str:
-    """A hash of a file and of all files that it names, such as textures."""
+    """Hash a file and all files that it names, such as textures. Returns the hash as text."""
     result, files = hashlib.blake2b(digest_size=16), [file]
     for each in files:  # the list grows in the loop
         content, kind = each.read_bytes(), each.suffix.lower()
@@ -264,7 +295,7 @@ def digest(file: Path) -> str:
 
 
 def settings_of(config: SynthesizeConfig) -> dict:
-    """The options that affect a capture, and hashes of their files, as JSON values."""
+    """Return the options that affect a capture, and hashes of the files that they name, as a JSON value."""
     values = asdict(config) | {"digests": {}}
     del values["out"]
     for name in ("mesh", "material", "second", "pattern", "environment"):
@@ -277,7 +308,7 @@ def settings_of(config: SynthesizeConfig) -> dict:
 
 
 def claim(out: Path, config: SynthesizeConfig) -> None:
-    """Raise InputError unless the folder `out` is empty, missing, or has this capture, complete or not."""
+    """Raise InputError if the folder `out` contains anything but this capture, complete or not."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     found = read_json(out / SETTINGS)

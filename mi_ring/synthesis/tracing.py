@@ -1,4 +1,4 @@
-"""Renders images by Mitsuba's path tracer along our own rays, independently of the renderer of a fit."""
+"""Renders images by Mitsuba's path tracer along its own rays. It shares no code with the renderer of a fit."""
 
 import functools
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class LensCamera:
     motion: tuple[float, float] = (0.0, 0.0)  #: shift of the image during the exposure [px]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points (n, 3) in the middle of the exposure: pixel coordinates (n, 2)."""
+        """Project points (n, 3), at the middle of the exposure. Returns pixel coordinates (n, 2)."""
         x, y, z = ((points - self.camera.position) @ self.camera.to_world[:3, :3]).T
         tangents = np.stack([-x / z, -y / z], 1)
         r2 = (tangents**2).sum(1, keepdims=True)
@@ -36,7 +36,10 @@ class LensCamera:
         return tangents * (1 + k1 * r2 + k2 * r2**2) * self.camera.focal + self.camera.centre
 
     def around(self, points: np.ndarray) -> Window:
-        """The window of the image with points (n, 3) in front of the camera, and `MARGIN` around them."""
+        """Return the smallest window of the image that shows points (n, 3), with a margin of `MARGIN` pixels.
+
+        The points must be in front of the camera.
+        """
         pixels, size = self.project(points), np.array(self.camera.size)
         left, top = np.clip(pixels.min(0) - MARGIN, 0, size - 1).astype(int).tolist()
         right, bottom = np.clip(pixels.max(0) + MARGIN + 1, [left + 1, top + 1], size).astype(int).tolist()
@@ -44,7 +47,10 @@ class LensCamera:
 
 
 def rays_of(view: LensCamera, window: Window, spp: int, seed: int) -> mi.RayDifferential3f:
-    """Make `spp` (a square number) stratified rays through each pixel of a window. A pixel's rays are consecutive."""
+    """Make `spp` stratified rays through each pixel of a window. `spp` must be a square number.
+
+    The rays of a pixel are in consecutive lanes.
+    """
     left, top, right, bottom = window
     side = round(spp**0.5)
     number = functools.partial(dr.opaque, mi.Float)  # not a literal: all views share one compiled kernel
@@ -70,7 +76,10 @@ def rays_of(view: LensCamera, window: Window, spp: int, seed: int) -> mi.RayDiff
 
 
 def radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth: int, hidden: bool = False) -> list:
-    """Trace rays by `path`: radiance [R, G, B]. `depth` 2: direct light only; `hidden`: emitters are invisible."""
+    """Trace rays by Mitsuba's `path`. Returns the radiance [R, G, B] of each ray.
+
+    `depth`: largest length of paths; 2: direct light only. `hidden`: emitters are invisible to the camera.
+    """
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed % 2**32, dr.width(rays))
     path = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": hidden})
@@ -78,7 +87,10 @@ def radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth
 
 
 def clamped_radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth: int, limit: float) -> list:
-    """Trace rays like `radiance_along`, but clip indirect radiance to `limit`: rare bright paths leave white dots."""
+    """Trace rays as `radiance_along` does, but clip indirect radiance to `limit`.
+
+    Otherwise rare bright paths would leave white dots in the image.
+    """
     direct = radiance_along(rays, seed, scene, 2)
     if depth == 2:
         return direct
@@ -86,13 +98,16 @@ def clamped_radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scen
 
 
 def hits_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, shape: mi.Shape) -> list:
-    """Trace rays to their first hit: [1 if that is this shape, otherwise 0]."""
+    """Trace rays to their first hit. Returns one channel: 1 if the ray hits `shape`, otherwise 0."""
     hit = scene.ray_intersect_preliminary(rays)
     return [dr.select(hit.is_valid() & (hit.shape == mi.ShapePtr(shape)), mi.Float(1), 0)]
 
 
 def pixel_means(trace: Trace, view: LensCamera, window: Window, spp: int, seed: int) -> np.ndarray:
-    """Average `trace` over the rays of each pixel of a window: (H, W, channels); 0 outside the window."""
+    """Average the function `trace` over the rays of each pixel. Returns an image (H, W, channels).
+
+    Only pixels in the `window` are rendered; the others are 0. `spp`: rays per pixel.
+    """
     left, top, right, bottom = window
     rows = max(1, LANES // ((right - left) * spp))
     parts = []

@@ -1,4 +1,4 @@
-"""Camera poses: evenly around the object, hand-held, or around a turntable."""
+"""Makes camera poses: evenly around the object, as if hand-held, or around a turntable."""
 
 from typing import Literal
 
@@ -14,7 +14,10 @@ GOLDEN = np.pi * (3 - np.sqrt(5))  #: golden angle [rad] of a Fibonacci spiral, 
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray, roll: float = 0.0) -> np.ndarray:
-    """Make a camera-to-world matrix (4, 4), x left, y up, z forward. `roll`: about the viewing direction [rad]."""
+    """Make the camera-to-world matrix (4, 4) of a camera that looks from `position` to `target`; all are (3,).
+
+    The axes are x left, y up, z forward. `roll`: rotation about the viewing direction [rad].
+    """
     forward = (target - position) / np.linalg.norm(target - position)
     if abs(forward @ up) > 0.99 * np.linalg.norm(up):  # the camera looks along `up`: take another direction
         up = np.roll(up, 1)
@@ -30,10 +33,11 @@ def poses(
     kind: CameraKind, count: int, radius: float, distance: float, up: np.ndarray, random: np.random.Generator,
     elevations: tuple[float, ...] = (20.0, 55.0), standing: bool = False,
 ) -> list[np.ndarray]:  # fmt: skip
-    """Place `count` cameras around an object at the origin: camera-to-world matrices (4, 4).
+    """Place `count` cameras around an object at the origin. Returns camera-to-world matrices (4, 4).
 
-    `radius`: of the object; `distance`: of cameras from the origin; `elevations`: of the rings of cameras around a
-    turntable [deg]; `standing`: no camera is below the table.
+    `radius`: radius of the object. `distance`: distance of the cameras from the origin. `up` (3,): up direction.
+    `elevations`: angles of the rings of cameras above the turntable [deg]. `standing`: the object stands on a table, so
+    no camera is below it.
     """
     upright = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])[0].as_matrix()
     low = LOWEST if standing else -1.0
