@@ -35,7 +35,8 @@ class ExportConfig(MaterialOptions):
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """Results folder of a fit, or its ring.pt."""
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
-    """File to write. OBJ and XML need further files, which are written beside it."""
+    """File to write. Its suffix selects the format: .ply, .obj, .glb or .xml (a scene for Mitsuba).
+    For .obj and .xml, textures and meshes are written beside it."""
     subdivisions: int | None = None
     """Level of the mesh, which has about 10 · 4^level vertices. The highest level is 10 for .ply, 8 for other files.
     A lower level gives a smaller file, a higher level a finer mesh.

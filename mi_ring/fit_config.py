@@ -29,7 +29,8 @@ class Task:
     """Mitsuba XML file that names the photographs, their cameras and lights."""
     out: Path | None = None
     """Folder for the results. Without this option: out/NAME.
-    NAME is the name of the scene file without .xml: pot.xml gives out/pot. pot/scene.xml gives out/pot, too."""
+    NAME is the name of the scene file without .xml: pot.xml gives out/pot. If the file is called scene.xml, NAME is
+    the name of its folder: pot/scene.xml gives out/pot."""
     resume: bool = False
     """Continue an interrupted fit from the checkpoint in its results folder. Give the same options as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"

@@ -96,7 +96,7 @@ class Calibration(nn.Module):
     def solves_room(self, progress: float) -> bool:
         """Test whether the fit estimates the room's light at this `progress`, 0 to 1.
 
-        If there is no other light, the fit estimates the room's light from the start.
+        If the room's light is the only one, the fit estimates it from the start. Otherwise it begins at `ROOM_START`.
         """
         return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
 

@@ -91,7 +91,7 @@ def table3(options: ExperimentOptions) -> list[Run]:
 
 
 def specularity(options: ExperimentOptions) -> list[Run]:
-    """List one run for each material. All use the same mesh."""
+    """Plan fits of one mesh with materials from matt to glossy: one run for each material in `options`."""
     mesh = one_mesh(options)
     materials = options.materials or (GLOSSY[::2] if options.quick else GLOSSY)
     names = [short_name(material) for material in materials]

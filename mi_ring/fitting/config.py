@@ -64,8 +64,9 @@ class Common:
     masks: outlines of the object. The fit finds new masks after one half and three quarters of its iterations."""
     masks: Literal["auto", "given", "none"] = "auto"
     """The masks that the fit uses. Set none if the masks of the scene file are wrong and the background is dark.
-    given: the masks of the scene file. none: the fit ignores these masks; in a dark room it uses the bright pixels.
-    auto: given if the scene file has masks, otherwise none. To fit without any mask, set --weights.mask 0."""
+    given: the masks of the scene file.
+    none: the fit ignores these masks. If the room is dark, it makes its own: the bright pixels. Otherwise it has none.
+    auto: given if the scene file has masks, otherwise none. To use no mask in any case, set --weights.mask 0."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
     """The start surface that the fit deforms. The fitted surface has the same number of handles (genus).
     hull: the visual hull of the masks. mesh FILE: a closed mesh in scene units. sphere: a sphere around the object.
@@ -159,8 +160,8 @@ class Ablation:
     """The optimisers that train the networks. Set adam to train them as in the paper.
     muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all weights, as in the paper."""
     shape_net: Literal["ring", "resnet", "wide-resnet"] = "ring"
-    """The network that deforms the start surface. Set resnet or wide-resnet only to compare them with ring.
-    ring: the paper's flow. All steps use one network.
+    """The network that deforms the start surface, in several steps. Set resnet or wide-resnet only to compare.
+    ring: as in the paper "One Ring to Rule Them All". The same network makes all steps.
     resnet: each step has its own, narrower network. All together have about as many weights as the network of ring.
     wide-resnet: each step has its own network, as wide as the network of ring.
     With resnet and wide-resnet the surface may fold over."""

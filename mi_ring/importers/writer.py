@@ -80,10 +80,11 @@ class Writer:
 
 
 def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
-    """Write the image, mask and valid pixels of a frame, if they must change.
+    """Write those files of a frame whose pixels must change: image, mask, valid pixels.
 
-    `copy`: also copy the files that need not change. `name`: name of the files without suffix. Returns the paths of all
-    files for the scene file.
+    Pixels change if the lens has distortion, if the photograph must be turned, and if the scene file cannot express the
+    `encoding` of the file. `copy`: also copy the files that need not change. `name`: name of the new files without
+    suffix. Returns the paths of all files, new and old, for the scene file.
     """
     straight, pixels, turn = frame.lens.is_pinhole, frame.pixels, frame.orientation
 

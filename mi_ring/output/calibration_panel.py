@@ -36,9 +36,10 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
-    """Format an unknown as a row of the table: (quantity, value before, value after, standard deviation).
+    """Format an unknown as a row: (quantity, value in the scene file, value that the fit found, standard deviation).
 
-    `entry`: the unknown's entry in calibration.json. If it has many values, the row has their median change.
+    `entry`: the unknown's entry in calibration.json. If it has many values, the second cell is empty, and the third has
+    the median and the largest change.
     """
     if np.size(entry["after"]) > LISTED:
         several = len(entry["after"]), -1

@@ -58,7 +58,10 @@ def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation:
 
 
 def reduce_photograph(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> ReducedView:
-    """Make the view of a window of a photograph. `pose` (4, 4): camera-to-world, OpenCV's axes."""
+    """Reduce a photograph to the scale of `window`, remove the distortion of its `lens`, and crop it to the window.
+
+    `pose` (4, 4): camera-to-world, OpenCV's axes. Returns the pixels, which of them are valid, and their camera.
+    """
     rgb, camera = picture.srgb(), lens.camera(pose).shrunk(window.scale)
     corner = np.array([window.left, window.top]) / window.scale
     camera = camera._replace(centre=camera.centre - corner, size=(window.width, window.height))

@@ -57,9 +57,10 @@ class Lights:
         return dr.gather(mi.Vector3f, self.places, k), dr.gather(mi.Bool, self.finite, k)
 
     def sample(self, k, si):
-        """Sample light `k` at the surface interactions `si`. Returns (DirectionSample3f, radiance · d⁻²).
+        """Compute the light that arrives at the surface interactions `si`, if nothing is in its way.
 
-        `k`: one number per lane.
+        `k`: index of the light, one for each interaction. Returns (the direction to the light as DirectionSample3f,
+        irradiance of a surface that faces it). For a point light the latter is its intensity / distance².
         """
         where, finite = self.eye(k)
         strength = dr.gather(mi.Color3f, self.strengths, k)

@@ -106,8 +106,9 @@ class SynthesizeConfig:
     """EXR or HDR file of an environment map (latitude, longitude). It replaces the lights of --light and --room."""
     table: Literal["none", "plain", "sheet"] = "none"
     """Put a table below the object. The table hides the underside of the object and reflects light onto the object.
-    none: no table. plain: a table of one colour. sheet: a table with the sheet of mi-ring board on it. With sheet,
-    --radius is in millimetres."""
+    none: no table. plain: a table of one colour.
+    sheet: a table with the printed sheet of mi-ring board, by whose markers mi-ring photos finds scale and cameras.
+    The sheet has a size in millimetres. So --radius, the size of the object, is then in millimetres, too."""
 
     format: Format = "exr"
     """Format of the photographs.
