@@ -610,7 +610,7 @@ def test_a_users_mistake_is_one_line_before_anything_is_written(case, tmp_path, 
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(("folder", "words"), [("run", "--integrator: is x"), ("nothing", "nothing/ring.pt: no such")])
+@pytest.mark.parametrize(("folder", "words"), [("run", "--integrator: x: "), ("nothing", "nothing: no such file")])
 def test_its_status_is_2(folder, words, tmp_path, run, capsys):
     (tmp_path / "run").symlink_to(run)
     arguments = [str(tmp_path / folder), str(write_scene(tmp_path)), str(tmp_path / "out"), "--integrator", "x"]
