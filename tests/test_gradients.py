@@ -34,7 +34,7 @@ CELLS = [  # moved, light, wall, shape, unit, channels, how many
     ("light moves", "directional", True, "sphere", 1.0, RADIANCE, QUIET),
     ("light moves", "flash", True, "bumpy", 1.0, RADIANCE, QUIET),
     ("principal point", "lamp", False, "bumpy", 1.0, RADIANCE, NOISY),
-    ("distortion", "flash", False, "bumpy", 1.0, COVERAGE, QUIET),
+    ("distortion", "flash", False, "bumpy", 1.0, COVERAGE, NOISY),
     ("falloff", "flash", False, "bumpy", 1000.0, RADIANCE, QUIET),
     ("room", "flash", True, "bumpy", 1.0, RADIANCE, QUIET),
     ("intensity", "flash", False, "sphere", 1.0, RADIANCE, QUIET),
