@@ -166,11 +166,11 @@ def turn(t):
     return mi.AffineTransform4f().rotate(mi.Vector3f(*AXIS), t * (180 / dr.pi))
 
 
-def compare(picture, channels, seeds, spp):
-    """(gradient, finite difference, standard error of their difference)."""
+def compare(picture, channels, gradients, differences, spp):
+    """(gradient, finite difference, standard error of their difference), means of so many; `spp`: of a difference."""
     # Ten apart: parts of a picture have the seeds next to its own.
-    a = [picture.gradient(100 + 10 * seed, 64, channels) for seed in range(4 * seeds)]
-    b = [picture.difference(seed, spp, channels) for seed in range(seeds)]
+    a = [picture.gradient(100 + 10 * seed, 64, channels) for seed in range(gradients)]
+    b = [picture.difference(seed, spp, channels) for seed in range(differences)]
     error = np.hypot(np.std(a, ddof=1) / np.sqrt(len(a)), np.std(b, ddof=1) / np.sqrt(len(b)))
     return np.mean(a), np.mean(b), error
 
@@ -214,7 +214,8 @@ def main() -> None:
                         row.append("")
                         continue
                     picture = Picture(moved, light, wall, shape, unit)
-                    row.append(cell(*compare(picture, channels, options.seeds, options.spp), allowed(light, wall)))
+                    found = compare(picture, channels, 4 * options.seeds, options.seeds, options.spp)
+                    row.append(cell(*found, allowed(light, wall)))
                 print(f"| {moved} | " + " | ".join(row) + " |", flush=True)
             print(flush=True)
 

@@ -224,5 +224,6 @@ def short_trials(monkeypatch):
     """Coarse fits of few iterations."""
     from mi_ring.fitting import light_selection
 
-    brief = {"iterations": 14, "levels": (2,), "batch": 4}
+    brief = {"iterations": 9, "levels": (2,), "batch": 4}
     monkeypatch.setattr(light_selection, "COARSE", light_selection.COARSE | brief)
+    monkeypatch.setattr(light_selection, "LAST", 7)

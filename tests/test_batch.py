@@ -265,14 +265,14 @@ def test_fits_go_on_when_their_processes_and_workers_are_killed(small_capture, t
     def kill(whom):
         deadline = time.monotonic() + 200
         while time.monotonic() < deadline:
-            running = psutil.process_iter(["cmdline"])
+            running = psutil.process_iter(["cmdline"]) if (out / "small/checkpoint.pt").exists() else ()
             own = [p for p in running if str(out / "small") in "\0".join(p.info["cmdline"] or [])]
-            if (out / "small/checkpoint.pt").exists() and own:
+            if own:
                 {"fit": own[0], "worker": own[0].parent()}[whom].kill()
                 killed.append(whom)
                 own[0].wait(deadline - time.monotonic())  # it dies with its worker
                 return
-            time.sleep(0.02)
+            time.sleep(0.05)
 
     assassin = threading.Thread(target=lambda: [kill("fit"), kill("worker")])
     assassin.start()

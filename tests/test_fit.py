@@ -13,7 +13,7 @@ import trimesh
 from helpers.quick_fits import FILES, ITERATIONS, SPHERE, TABLE, distance
 from PIL import Image
 
-from mi_ring import __main__, fit, render
+from mi_ring import fit, render
 from mi_ring.capture import capture
 from mi_ring.capture.loading import load_capture
 from mi_ring.fitting.config import Config
@@ -172,29 +172,11 @@ def test_a_finished_fit_is_fitted_anew_and_not_silently(finished, tmp_path, caps
     assert [element.get("value") for element in weights] == ["ring.pt"]
 
 
-def call(*arguments, module="fit"):
-    """Exit status and standard error of a command in a process of its own."""
-    done = subprocess.run([sys.executable, "-m", f"mi_ring.{module}", *map(str, arguments)],
-                          capture_output=True, text=True, timeout=120)  # fmt: skip
-    return done.returncode, done.stderr
-
-
 def test_a_users_mistake_is_one_line_and_status_2_before_any_work(broken_capture, tmp_path):
     path, _ = broken_capture
     (path.parent / "images/007.png").unlink()
-    status, complaint = call(path, "--out", tmp_path / "out")
-    assert status == 2 and complaint.count("\n") == 1
-    assert "007.png" in complaint and "filename" in complaint
+    done = subprocess.run([sys.executable, "-m", "mi_ring.fit", path, "--out", tmp_path / "out"],
+                          capture_output=True, text=True, timeout=120)  # fmt: skip
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "007.png" in done.stderr and "filename" in done.stderr
     assert not (tmp_path / "out").exists()
-
-
-def test_render_with_a_missing_run_is_one_line_and_status_2(small_capture, tmp_path):
-    status, complaint = call(tmp_path / "nothing", small_capture, tmp_path / "out", module="render")
-    assert status == 2 and complaint.count("\n") == 1 and "nothing" in complaint
-
-
-def test_program_lists_its_commands():
-    done = subprocess.run([sys.executable, "-c", "import sys; sys.argv[1:] = ['--help']; "
-                           "from mi_ring.__main__ import main; main()"], capture_output=True, text=True)  # fmt: skip
-    assert done.returncode == 0
-    assert all(name in done.stdout for name in __main__.COMMANDS)

@@ -86,7 +86,8 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture, monke
             return self.capture
 
         def __iter__(self):
-            return iter([SimpleNamespace(terms={"rgb": 9.0})] * 48 + [SimpleNamespace(terms={"rgb": self.error})] * 12)
+            before, last = (SimpleNamespace(terms={"rgb": error}) for error in (9.0, self.error))
+            return iter([before] * (60 - light_selection.LAST) + [last] * light_selection.LAST)
 
     config, capture = mi_ring.Config.preset("fast", light=light), mi_ring.load_capture(small_capture)
     center, _ = capture.sphere()

@@ -10,8 +10,10 @@ import nbformat
 import numpy as np
 import pytest
 import trimesh
+from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
+from nbclient.util import run_sync
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -43,6 +45,8 @@ def test_notebook_is_stripped_and_portable(path):
     assert [cell for cell in code if cell.outputs or cell.execution_count is not None] == []
     assert [k for k, cell in enumerate(code) if "parameters" in cell.metadata.get("tags", ())] == [0]
     assert not re.search(r"""["'(\s](/|~/|[A-Za-z]:\\)\w""", "\n".join(cell.source for cell in notebook.cells))
+    before = "\n".join(cell.source for cell in code).partition("import mitsuba")[0]
+    assert re.search(r"^(import|from) mi_ring\b", before, re.M)  # which chooses LLVM
 
 
 def test_notebooks_are_all_run():
@@ -60,15 +64,24 @@ def copy(folder: Path) -> None:
     tree.write(folder / "scenes" / "pot2.xml")
 
 
-def execute(folder: Path, name: str):
+@pytest.fixture
+def kernel():
+    """One for all notebooks, which spares each the imports. Each begins without the names of those before."""
+    manager = AsyncKernelManager(kernel_name="python3")
+    yield manager
+    run_sync(manager.shutdown_kernel)(now=True)
+
+
+def execute(folder: Path, name: str, kernel: AsyncKernelManager):
     """Run a notebook in its folder, and return it with its outputs. Fails with the cell that fails, and why."""
     notebook = nbformat.read(folder / "notebooks" / f"{name}.ipynb", as_version=4)
     place = 1 + next(k for k, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", ()))
     override = "\n".join(f"{key} = {value!r}" for key, value in QUICK[name].items())
     notebook.cells.insert(place, nbformat.v4.new_code_cell(override))
+    notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f"))
     where = {"metadata": {"path": str(folder / "notebooks")}}
     try:
-        NotebookClient(notebook, timeout=300, kernel_name="python3", resources=where).execute()
+        NotebookClient(notebook, kernel, timeout=300, resources=where).execute()
     except CellExecutionError as error:
         failed = next(c for c in notebook.cells if any(o.output_type == "error" for o in c.get("outputs", ())))
         message = f"{name}: {error.ename}: {error.evalue}\n\nin the cell\n\n{failed.source}"
@@ -87,14 +100,14 @@ def pictures(notebook) -> int:
 
 
 @pytest.mark.slow
-def test_notebooks_run_in_order(tmp_path):
+def test_notebooks_run_in_order(tmp_path, kernel):
     copy(tmp_path)
     run = tmp_path / "out" / "first_fit"
 
     with pytest.raises(AssertionError, match="FileNotFoundError.*first_fit.*run notebook 1_first_fit first"):
-        execute(tmp_path, "3_read_a_run")
+        execute(tmp_path, "3_read_a_run", kernel)
 
-    first = execute(tmp_path, "1_first_fit")
+    first = execute(tmp_path, "1_first_fit", kernel)
     assert "Masks: 4 of 4 photographs" in printed(first)
     assert pictures(first) == 3  # contact sheet, start, a photograph beside its prediction
     evaluation = json.loads((run / "evaluation.json").read_text())
@@ -102,7 +115,7 @@ def test_notebooks_run_in_order(tmp_path):
     assert evaluation["iou"] > 0.9  # the start is the visual hull already
     assert min(view["normal_mean"] for view in evaluation["views"]) > 1  # in so few iterations it cannot be right
 
-    second = execute(tmp_path, "2_plugins")
+    second = execute(tmp_path, "2_plugins", kernel)
     assert pictures(second) == 3
     means = dict(re.findall(r"^(\w+, \w+) +mean radiance ([\d.]+)$", printed(second), re.M))
     means = {title: float(mean) for title, mean in means.items()}
@@ -110,21 +123,21 @@ def test_notebooks_run_in_order(tmp_path):
     assert means["photometric, left"] == pytest.approx(means["direct, left"], rel=0.02)
     assert means["path, left"] > 1.02 * means["direct, left"]
 
-    third = execute(tmp_path, "3_read_a_run")
+    third = execute(tmp_path, "3_read_a_run", kernel)
     assert pictures(third) == 4  # the log, the flow, the material, the evaluation
     mesh = trimesh.load(run / "mesh.ply")
     assert f"{len(mesh.vertices)} vertices, watertight: True" in printed(third)
     volumes = [float(v) for v in re.findall(r"level \d: .* volume (\d+)", printed(third))]
     assert len(volumes) == 4 and volumes[0] == pytest.approx(mesh.volume, rel=1e-3)  # level 3 is that of the mesh
 
-    execute(tmp_path, "4_relight_and_swap")
+    execute(tmp_path, "4_relight_and_swap", kernel)
     exported = trimesh.load(run / "object.glb", force="mesh")
     assert np.allclose(exported.bounds, mesh.bounds, atol=0.01 * mesh.scale)
     assert exported.visual.material.baseColorTexture.size == (64, 64)
     assert (run.parent / "other_glaze" / "ring.pt").is_file()
     assert (run / "turntable.mp4").read_bytes()[4:8] == b"ftyp"
 
-    fifth = execute(tmp_path, "5_own_parts")
+    fifth = execute(tmp_path, "5_own_parts", kernel)
     assert pictures(fifth) == 1 and "silhouettes" in printed(fifth)
     assert json.loads((run.parent / "own_parts" / "log.jsonl").read_text().splitlines()[-1])["silhouettes"] > 0
     assert {path.name for path in tmp_path.iterdir()} == {"notebooks", "scenes", "out"}

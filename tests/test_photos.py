@@ -29,19 +29,24 @@ from mi_ring.system.progress import progress
 OPENGL = np.diag([1.0, -1, -1, 1])
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """Photographs of an ellipsoid in a dim room with lamps, and their cameras as transforms.json."""
-    random, frames = np.random.default_rng(3), []
-    (tmp_path / "photographs").mkdir()
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory):
+    """The folder of which each test has a copy."""
+    folder, random, frames = tmp_path_factory.mktemp("photographed"), np.random.default_rng(3), []
     (fx, fy), (cx, cy) = LENS.focal, LENS.centre
     for k, pose in enumerate(poses(20)):
         rgb, _ = in_a_dim_room(pose, random)
-        Image.fromarray(rgb.astype(np.uint8)).save(tmp_path / f"photographs/{k:02}.png")
+        Image.fromarray(rgb.astype(np.uint8)).save(folder / f"{k:02}.png")
         frames.append({"file_path": f"{k:02}.png", "transform_matrix": (pose @ OPENGL).tolist()})
     top = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": 160, "h": 120, "frames": frames}
-    (tmp_path / "photographs/transforms.json").write_text(json.dumps(top))
-    return tmp_path / "photographs"
+    (folder / "transforms.json").write_text(json.dumps(top))
+    return folder
+
+
+@pytest.fixture
+def folder(photographed, tmp_path):
+    """Photographs of an ellipsoid in a dim room with lamps, and their cameras as transforms.json."""
+    return Path(shutil.copytree(photographed, tmp_path / "photographs"))
 
 
 def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):

@@ -2,8 +2,6 @@
 
 import contextlib
 import resource
-import subprocess
-import sys
 
 import imageio.v2 as imageio
 import mitsuba as mi
@@ -612,11 +610,15 @@ def test_a_users_mistake_is_one_line_before_anything_is_written(case, tmp_path, 
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_its_status_is_2(tmp_path, run):
-    path = write_scene(tmp_path)
-    done = subprocess.run([sys.executable, "-m", "mi_ring.render", run, path, tmp_path / "out", "--integrator", "x"],
-                          capture_output=True, text=True, timeout=120)  # fmt: skip
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stderr.startswith("mi_ring.render: --integr")
+@pytest.mark.parametrize(("folder", "words"), [("run", "--integrator: x: "), ("nothing", "nothing: no such file")])
+def test_its_status_is_2(folder, words, tmp_path, run, capsys):
+    (tmp_path / "run").symlink_to(run)
+    arguments = [str(tmp_path / folder), str(write_scene(tmp_path)), str(tmp_path / "out"), "--integrator", "x"]
+    with pytest.raises(SystemExit) as stop:
+        command.run("mi_ring.render", render.main, arguments)
+    complaint = capsys.readouterr().err
+    assert stop.value.code == 2 and complaint.count("\n") == 1
+    assert complaint.startswith("mi_ring.render: ") and words in complaint
 
 
 def test_pictures_by_other_integrators_are_made_in_passes_of_bounded_size(monkeypatch):
