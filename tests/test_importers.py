@@ -96,6 +96,18 @@ def test_metashape(tmp_path, kind, terms, where):
         np.testing.assert_allclose(landed(frame), agisoft(R, t, kind, **terms), atol=1e-5)
 
 
+def test_several_chunks_and_components_of_metashape_are_told(tmp_path, capsys):
+    path = metashape(tmp_path)
+    text = path.read_text()
+    chunk = text[text.index("<chunk") : text.index("</chunk>") + len("</chunk>")]
+    fewer = chunk[: chunk.index("<camera ")] + chunk[chunk.index("</camera>") + len("</camera>") :]
+    path.write_text(text.replace(chunk, fewer + chunk.replace("component_id='0'", "component_id='7'", 1)))
+    convert.main(["metashape", str(path), str(tmp_path / "s.xml")])
+    said = capsys.readouterr().out
+    assert "of its 2 chunks number 2 is taken, with 3 photographs; not used: number 1 (2)" in said
+    assert "component_id: photographs are 2 of 0, 1 of 7; components that are not aligned with each other" in said
+
+
 def test_metashape_leaves_out_what_is_disabled(tmp_path):
     path = metashape(tmp_path)
     path.write_text(path.read_text().replace("label='b'", "label='b' enabled='0'"))
@@ -328,7 +340,7 @@ def refused(arguments, pattern, folder):
     ("label='b'", "", "camera '1': label: is missing"),
     ("sensor_id='4'", "sensor_id='5'", "sensor_id: is '5'"),
     ("<f>70.0</f>", "", "sensor '4': f: is missing"),
-    ("<f>70.0</f>", "<f>wide</f>", "f: is .*; must be 1 number"),
+    ("<f>70.0</f>", "<f>wide</f>", "f: is .*; must be a number"),
     ("<f>70.0</f>", "<f>nan</f>", "f: has NaN"),
     ("<f>70.0</f>", "<f>-70</f>", "focal lengths above 0"),
     ("<f>70.0</f>", "<f>70</f><k4>0.1</k4>", "k4: is 0.1"),

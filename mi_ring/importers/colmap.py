@@ -78,9 +78,11 @@ class Colmap(Photogrammetry):
             pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # the exception repeats what it logs
             reconstruction = pycolmap.Reconstruction(str(model))
             registered = {*reconstruction.reg_image_ids()}
-            names = sorted((image.name, k) for k, image in reconstruction.images.items())  # fails if not UTF-8
+            names = [(image.name, k) for k, image in reconstruction.images.items()]  # fails if not UTF-8
         except Exception as error:
             raise InputError(f"{model}: not a COLMAP model ({' '.join(str(error).split())})") from error
+        texts = {} if (model / "images.bin").is_file() else names_in(model / "images.txt")
+        names = sorted((texts.get(k, name), k) for name, k in names)
         if not registered:
             raise InputError(f"{model}: images: no photograph has a pose")
         for name, k in names:
@@ -106,12 +108,18 @@ def is_model(folder: Path) -> bool:
     return any((folder / name).is_file() for name in ("images.bin", "images.txt"))
 
 
-def camera_lines(path: Path) -> Iterator[tuple[int, list[bytes]]]:
-    """Yield (line number, words) of each line of 2-D points in images.txt. It follows the line of its camera."""
+def camera_lines(path: Path) -> Iterator[tuple[bytes, int, list[bytes]]]:
+    """Yield for each camera in images.txt: its line, and (line number, words) of the 2-D points in the line after."""
     lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
     for number, line in lines:
         if line.strip() and not line.lstrip().startswith(b"#"):
-            yield number + 1, next(lines, (0, b""))[1].split()
+            yield line, number + 1, next(lines, (0, b""))[1].split()
+
+
+def names_in(path: Path) -> dict[int, str]:
+    """Read the photographs' names in images.txt, by IMAGE_ID. COLMAP itself reads a name up to its first space only."""
+    words = (line.split(maxsplit=9) for line, _, _ in camera_lines(path))
+    return {int(own[0]): own[9].decode().rstrip() for own in words if len(own) == 10}
 
 
 def count_images(folder: Path) -> int:
@@ -130,7 +138,7 @@ def require_points(folder: Path) -> None:
     """
     if (folder / "images.bin").is_file():
         return
-    for number, words in camera_lines(path := folder / "images.txt"):
+    for _, number, words in camera_lines(path := folder / "images.txt"):
         if len(words) % 3 or not all(map(NUMBER.fullmatch, words[:30])):
             raise InputError(f"{path}: line {number}: must be the points of the camera in the line before; put an "
                              "empty line after each camera")  # fmt: skip

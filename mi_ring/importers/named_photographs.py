@@ -126,7 +126,10 @@ class NamedPhotographs(Source):
                     frame.mask = frame.image
             if all(frame.mask for frame in frames):
                 return
-            places = dict.fromkeys(place / name for place in (root.parent, root) for name in MASKS)
+            ends = (root.name.removeprefix("images"), "") if root.name.startswith("images") else ("",)  # of images_2
+            places = dict.fromkeys(
+                place / f"{name}{end}" for end in ends for place in (root.parent, root) for name in MASKS
+            )
             folder = next((place for place in places if place.is_dir() and place != root), None)
         if folder is None:
             return
