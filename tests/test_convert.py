@@ -100,7 +100,7 @@ def test_transforms_of_nerf(tmp_path):
     frames = [
         {"file_path": "./train/r_0", "pl_pos": [1, 2, 3], "pl_intensity": [4, 5, 6]},
         {"file_path": "./train/r_1", "pl_pos": [3, 2, 1]},
-        {"file_path": "./train/r_2", "pl_intensity": 7},
+        {"file_path": "./train/r_2"},
     ]
 
     def pixels(k):
@@ -109,7 +109,7 @@ def test_transforms_of_nerf(tmp_path):
         return rgba
 
     angle = 0.8
-    source = transforms(tmp_path / "data", {"camera_angle_x": angle}, frames, pixels)
+    source = transforms(tmp_path / "data", {"camera_angle_x": angle, "pl_intensity": 7}, frames, pixels)
     scene = converted("transforms", source, tmp_path / "nerf.xml")
     f = 0.5 * W / np.tan(angle / 2)
     calibration = np.array([[f, 0, W / 2], [0, f, H / 2], [0, 0, 1]])
@@ -118,7 +118,7 @@ def test_transforms_of_nerf(tmp_path):
     lights = scene.photographs.lights
     R, t = list(cameras())[2]
     np.testing.assert_allclose(lights.positions(), [[1, 2, 3], [3, 2, 1], -R.T @ t], rtol=1e-4)
-    np.testing.assert_allclose(lights.rgb(), [[4, 5, 6], [1, 1, 1], [7, 7, 7]], rtol=1e-6)
+    np.testing.assert_allclose(lights.rgb(), [[4, 5, 6], [7, 7, 7], [7, 7, 7]], rtol=1e-6)
     rgb, _, mask, masked, _ = scene.observe([1])
     inside = disc()[..., 0] > 0
     assert masked.all() and (mask[0].numpy() == inside).all()
@@ -272,6 +272,17 @@ def test_a_name_in_a_model_that_is_no_text(colmap, tmp_path, form):
     path.write_bytes(path.read_bytes().replace(b"sub/1", b"sub/\xb2"))
     refused(["colmap", path.parent, "--images", colmap / "images"], "not a COLMAP model .*can't decode byte 0xb2",
             tmp_path / "new/scan.xml")  # fmt: skip
+
+
+def test_the_largest_of_models_in_sparse_and_below_is_taken(colmap, tmp_path, capsys):
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(colmap / "text"))
+    model.deregister_frame(2)
+    model.write_binary(str(colmap / "sparse"))
+    assert len(converted("colmap", colmap, tmp_path / "scan.xml").shots) == 3
+    said = f"Of COLMAP's models {colmap / 'sparse/0'} is taken, with 3 photographs; not used: {colmap / 'sparse'} (2)"
+    assert said in capsys.readouterr().out
 
 
 def test_names_with_spaces_in_text(colmap, tmp_path):

@@ -229,6 +229,18 @@ def test_photographs_of_another_size_are_refused_with_what_to_do(tmp_path):
 # Masks
 
 
+def test_folders_of_masks_have_any_case_and_others_are_told(tmp_path, capsys):
+    folder = colmap_folder(tmp_path)
+    (folder / "masks").rename(folder / "Masks")
+    assert all(converted("colmap", folder, tmp_path / "a.xml").masks.given)
+    (folder / "Masks/sub").rename(folder / "object_mask")
+    scene = converted("colmap", folder, tmp_path / "b.xml", "--images", folder / "images/sub")
+    assert not any(scene.masks.given) and "object_mask" not in capsys.readouterr().out  # two levels above
+    (folder / "object_mask").rename(folder / "images/object_mask")
+    converted("colmap", folder, tmp_path / "c.xml", "--images", folder / "images/sub")
+    assert "images/object_mask: not used; give --masks if it holds the masks" in capsys.readouterr().out
+
+
 def test_masks_of_reduced_photographs(tmp_path):
     folder = colmap_folder(tmp_path)
     shown = Image.open(folder / "masks/sub/1.jpg.png").resize((31, 26), Image.Resampling.NEAREST)

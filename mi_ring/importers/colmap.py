@@ -45,16 +45,18 @@ class Colmap(Photogrammetry):
     )  # fmt: skip
 
     @staticmethod
-    def model(src: Path) -> Path | None:
+    def models(src: Path) -> list[Path]:
+        """List the folders of models in or below the folder `src`, in the first place that has some."""
+        inside = ([src / "sparse", *(src / "sparse").glob("*")], (src / "colmap/sparse").glob("*"), src.glob("*"))
+        return next((found for places in ([src], *inside) if (found := sorted(filter(is_model, places)))), [])
+
+    @classmethod
+    def model(cls, src: Path) -> Path | None:
         """Find the model with the most photographs in or below the folder `src`.
 
         Returns its folder, or None without a model.
         """
-        inside = ((src / inner).glob("*") for inner in ("sparse", "colmap/sparse", "."))
-        for places in ([src], [src / "sparse"], *inside):
-            if models := sorted(filter(is_model, places)):
-                return max(models, key=count_images)
-        return None
+        return max(cls.models(src), key=count_images, default=None)
 
     @property
     def folder(self) -> Path:
@@ -66,11 +68,11 @@ class Colmap(Photogrammetry):
         if model is None:
             raise InputError(f"{self.src}: SRC: neither images.bin nor images.txt, nor a folder sparse/0 with them")
         require_points(model)
-        if model.name.isdigit():
-            others = [folder for folder in sorted(model.parent.iterdir()) if is_model(folder) and folder != model]
-            if sizes := ", ".join(f"{folder} ({count_images(folder)})" for folder in others):
-                self.notes.append(f"Of COLMAP's models {model} is taken, with {count_images(model)} photographs; not "
-                                  f"used: {sizes}")  # fmt: skip
+        siblings = [model.parent, *model.parent.iterdir()] if model == self.src else self.models(self.src)
+        others = [folder for folder in sorted(siblings) if is_model(folder) and folder != model]
+        if sizes := ", ".join(f"{folder} ({count_images(folder)})" for folder in others):
+            self.notes.append(f"Of COLMAP's models {model} is taken, with {count_images(model)} photographs; not used: "
+                              f"{sizes}")  # fmt: skip
         pycolmap = need("pycolmap", f"{model}")
         if size := sum(file.stat().st_size for file in model.glob("*.bin")):
             require_readable(READ_MODEL, model, size, "a COLMAP model")
