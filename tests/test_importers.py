@@ -130,6 +130,16 @@ def test_realitycapture_sidecars(tmp_path, model, elements, count):
         np.testing.assert_allclose(landed(frame), capturing_reality(R, t, terms), atol=1e-5)
 
 
+def test_sidecars_have_any_case_and_those_without_a_photograph_are_told(tmp_path):
+    folder = sidecars(tmp_path)
+    for file in list(folder.glob("*.xmp")):
+        file.rename(file.with_suffix(".XMP"))
+    (folder / NAMES[1]).unlink()
+    source = RealityCapture(folder, Path())
+    assert [frame.image.name for frame in taken(source)] == [NAMES[0], NAMES[2]]
+    assert source.without_photograph == [Path(NAMES[1]).stem]
+
+
 def test_realitycapture_table(tmp_path):
     source = RealityCapture(csv_table(tmp_path), Path())
     frames = taken(source)
