@@ -68,11 +68,12 @@ FIELDS = {
         },
     ),
     "WebP, AVIF, HEIF, BMP": Fields(
-        used={"icc_profile nclx_profile": "colours; in AVIF, too", "exif original_orientation": "EXIF data"},
+        used={"icc_profile* nclx_profile": "colours; in AVIF, too", "exif original_orientation": "EXIF data"},
         told={"duration": ANIMATED},
         harmless={
             "xmp metadata* thumbnails depth_images aux": "text, previews, other maps",
-            "primary bit_depth chroma loop background timestamp compression dpi jfif* adobe* transparency": "the file",
+            "primary bit_depth chroma loop background timestamp compression dpi resolution": "the file",
+            "jfif* adobe* transparency": "the file",
         },
     ),
     "raw": Fields(used={

@@ -60,8 +60,8 @@ class BoundedFile(io.BufferedReader):
 def open_image(path: Path) -> Iterator[Image.Image]:
     """Context manager that opens an image file with Pillow, without reading its pixels.
 
-    Raises ValueError if the file is no image or declares an implausible size. Raises InputError for a HEIF file if the
-    package pillow_heif is not installed. A damaged file raises errors of other types.
+    Raises ValueError if the file is no image, is CMYK or declares an implausible size. Raises InputError for a HEIF
+    file if the package pillow_heif is not installed. A damaged file raises errors of other types.
     """
     if path.suffix.lower() in HEIF:
         need("pillow_heif", f"{path}").register_heif_opener()
@@ -73,6 +73,8 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         except UnidentifiedImageError as error:  # its message does not name the file
             raise ValueError(f"its content is none of {KINDS}; save it as one of them") from error
         with image:
+            if image.mode in ("CMYK", "YCCK"):
+                raise ValueError("its colours are those of inks, CMYK; save it as RGB")
             bands = 4 if image.has_transparency_data else len(image.getbands())  # palettes become RGBA
             require_plausible_size(path, 2 * bands * math.prod(image.size))
             yield image
@@ -95,18 +97,42 @@ def exif_of(path: Path) -> Image.Exif:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Read (width, height) [px] from the header of an image file, as stored. Raises the errors of `open_image`."""
+    """Read (width, height) [px] from the header of an image file, as stored.
+
+    Raises the errors of `open_image`, `exr_size`, `exr_picture` and `tiff_page`, before pixels are read.
+    """
     suffix = path.suffix.lower()
     if suffix == ".exr":
+        exr_picture(exr_channels(dict(exr_attributes(path))[b"channels"]))
         return exr_size(path)[:2]
     if suffix in TIFF:  # Pillow would rotate it by its orientation; `read_image` does not
         with tifffile.TiffFile(path) as file:
-            return file.pages.first.imagewidth, file.pages.first.imagelength
+            page = tiff_page(file)
+            return page.imagewidth, page.imagelength
     if suffix in RAW:
         with need("rawpy", f"{path}").imread(str(path)) as raw:
             return raw.sizes.iwidth, raw.sizes.iheight
     with open_image(path) as image:
         return image.size
+
+
+def tiff_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
+    """Return the first page of a TIFF file.
+
+    Raises ValueError for CMYK and other colours, for integers of more than 16 bits, and for several pictures.
+    """
+    page, kinds = file.pages.first, tifffile.PHOTOMETRIC
+    if page.photometric == kinds.SEPARATED:
+        raise ValueError("its colours are those of inks, CMYK; save it as RGB")
+    jpeg = page.photometric == kinds.YCBCR and "JPEG" in tifffile.COMPRESSION(page.compression).name
+    if not jpeg and page.photometric not in (kinds.RGB, kinds.PALETTE, kinds.MINISBLACK, kinds.MINISWHITE):
+        raise ValueError(f"its colours are {getattr(page.photometric, 'name', page.photometric)}; save it as RGB")
+    if page.dtype is None or not (page.dtype.kind == "f" or (page.dtype.kind in "bu" and page.dtype.itemsize <= 2)):
+        raise ValueError(f"has {page.dtype} pixels, whose full scale is unknown; save it with 8 or 16 bits, or as "
+                         "floats")  # fmt: skip
+    if len(file.pages) > 1 and math.prod(file.pages[1].shape) >= math.prod(page.shape):
+        raise ValueError(f"has {len(file.pages)} pictures; save the photograph alone")
+    return page
 
 
 def has_alpha_channel(path: Path) -> bool:
@@ -261,8 +287,9 @@ def exr_picture(names: Sequence[str]) -> list[str]:
     if len(layers) > 1:
         raise ValueError(f"has the layers {', '.join(layer.rstrip('.') for layer in layers[:6])}; save the one of the "
                          "photograph alone")  # fmt: skip
-    wanted = [f"{layers[0]}{c}" for c in "RGBA"] if layers else ["Y", "A"] if "Y" in names else names
-    if not layers and "Y" not in names and (len(names) > 1 or names[0].rpartition(".")[2] in ("Z", "depth")):
+    grey = "Y" in names and not ({"X", "Z"} <= {*names} or "RY" in names)  # not of colours XYZ, or Y and chroma
+    wanted = [f"{layers[0]}{c}" for c in "RGBA"] if layers else ["Y", "A"] if grey else names
+    if not layers and not grey and (len(names) > 1 or names[0].rpartition(".")[2] in ("Z", "depth")):
         raise ValueError(f"has channels {', '.join(names[:6])}, but no R, G, B; save the photograph alone")
     return [name for name in wanted if name in names]
 

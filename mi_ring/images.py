@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from mi_ring.colour_profiles import as_stated
 from mi_ring.colour_profiles import srgb_to_linear as srgb_to_linear  # beside its inverse for those who read images
 from mi_ring.foreign import require_plausible_size
-from mi_ring.image_headers import RAW, TIFF, bits_of, exr_picture, exr_size, open_image, statement_of
+from mi_ring.image_headers import RAW, TIFF, bits_of, exr_picture, exr_size, open_image, statement_of, tiff_page
 from mi_ring.system.files import write_file
 from mi_ring.system.machine import exr_threads
 from mi_ring.system.optional import need
@@ -78,8 +78,6 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
         pixels = read_raw(path)
     else:
         with open_image(path) as image:
-            if image.mode in ("CMYK", "YCCK"):
-                raise ValueError("its colours are those of inks, CMYK; save it as RGB")
             if bits_of(path) == 16:  # Pillow reduces 16 bits to 8; Mitsuba does not
                 pixels = np.array(mi.Bitmap(str(path)), copy=True)
             elif image.has_transparency_data:  # of palettes, too
@@ -96,18 +94,8 @@ def read_tiff(path: Path) -> np.ndarray:
     """Read the pixels (H, W, C) of the first page of a TIFF file. Raises the errors of `read_image`."""
     kinds = tifffile.PHOTOMETRIC
     with tifffile.TiffFile(path) as file:
-        page = file.pages.first
-        if page.photometric == kinds.SEPARATED:
-            raise ValueError("its colours are those of inks, CMYK; save it as RGB")
-        jpeg = page.photometric == kinds.YCBCR and "JPEG" in tifffile.COMPRESSION(page.compression).name
-        if not jpeg and page.photometric not in (kinds.RGB, kinds.PALETTE, kinds.MINISBLACK, kinds.MINISWHITE):
-            raise ValueError(f"its colours are {getattr(page.photometric, 'name', page.photometric)}; save it as RGB")
-        if page.dtype is None or not (page.dtype.kind == "f" or (page.dtype.kind in "bu" and page.dtype.itemsize <= 2)):
-            raise ValueError(f"has {page.dtype} pixels, whose full scale is unknown; save it with 8 or 16 bits, or as "
-                             "floats")  # fmt: skip
-        if len(file.pages) > 1 and math.prod(file.pages[1].shape) >= math.prod(page.shape):
-            raise ValueError(f"has {len(file.pages)} pictures; save the photograph alone")
-        require_plausible_size(path, math.prod(page.shape) * page.dtype.itemsize)
+        page = tiff_page(file)
+        require_plausible_size(path, page.nbytes)
         for count, what in ((sum(page.databytecounts), "bytes"), (math.prod(page.chunked), "strips or tiles")):
             if count > path.stat().st_size:  # the reader would request each of them
                 raise ValueError(f"declares {count:,} {what}, but is shorter")
@@ -115,7 +103,7 @@ def read_tiff(path: Path) -> np.ndarray:
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and pixels.ndim == 3:
             pixels = np.moveaxis(pixels, 0, -1)
         if page.photometric == kinds.PALETTE:
-            return (page.colormap[:, pixels].transpose(1, 2, 0) >> 8).astype(np.uint8)
+            return (np.asarray(page.colormap)[:, pixels].transpose(1, 2, 0) >> 8).astype(np.uint8)
         if pixels.dtype == bool:
             pixels = pixels.astype(np.uint8) * np.uint8(255)
         elif pixels.dtype.kind == "u" and (bits := page.bitspersample) not in (8, 16):  # stored in the low bits
@@ -158,11 +146,16 @@ def read_raw(path: Path) -> np.ndarray:
 def mask_values(pixels: np.ndarray) -> np.ndarray:
     """Convert the pixels (H, W, C) of a mask file to the mask (H, W) uint8, from 0 to 255.
 
-    The mask is the alpha channel if there is one and it is not constant, otherwise the first channel.
+    The mask is the alpha channel if there is one and it is not constant. Otherwise it is the channel that varies most,
+    because the object may have any colour. If there is one value beside 0, such as the label 1, it becomes 255.
     """
-    channel = pixels[..., 0]
-    if pixels.shape[2] in (2, 4) and pixels[..., -1].min() < pixels[..., -1].max():
-        channel = pixels[..., -1]
+    count = pixels.shape[2]
+    extent = np.ptp(pixels, (0, 1))
+    has_alpha = count in (2, 4) and extent[-1] > 0
+    channel = pixels[..., -1 if has_alpha else extent[: 3 if count > 2 else 1].argmax()]
+    shown = channel[channel > 0]
+    if 0 < shown.size < channel.size and shown.min() == shown.max():
+        return np.where(channel > 0, np.uint8(255), np.uint8(0))
     full = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(pixels.dtype, 1)
     return (channel.astype(np.float32) * (255 / full)).round().astype(np.uint8)
 

@@ -116,6 +116,15 @@ def test_an_empty_mask_is_named_and_the_rest_is_looked_at(broken_capture, tmp_pa
     assert status == 1 and text.count("Problem") == 1 and "Problem: 005.png: its mask is empty" in text, text
 
 
+@pytest.mark.parametrize("wrong", [lambda mask: 255 - mask, lambda mask: np.full_like(mask, 255)])
+def test_masks_that_agree_but_cover_the_border_are_named(broken_capture, tmp_path, capsys, wrong):
+    """The background is all around the cameras, so that the masks of all photographs confirm it."""
+    path, _ = broken_capture
+    edit_images(path, wrong, "masks")
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and "inverted" in text and "255 is to be the object, 0 the background" in text, text
+
+
 def test_few_photographs(broken_capture, tmp_path, capsys):
     path, _ = broken_capture
     text = path.read_text()

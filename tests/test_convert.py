@@ -1,6 +1,7 @@
 """Other people's formats: points land on the same pixels before and after, by each format's own formulas."""
 
 import json
+import shutil
 
 import mitsuba as mi
 import numpy as np
@@ -99,7 +100,7 @@ def test_transforms_of_nerf(tmp_path):
     frames = [
         {"file_path": "./train/r_0", "pl_pos": [1, 2, 3], "pl_intensity": [4, 5, 6]},
         {"file_path": "./train/r_1", "pl_pos": [3, 2, 1]},
-        {"file_path": "./train/r_2", "pl_intensity": 7},
+        {"file_path": "./train/r_2"},
     ]
 
     def pixels(k):
@@ -108,7 +109,7 @@ def test_transforms_of_nerf(tmp_path):
         return rgba
 
     angle = 0.8
-    source = transforms(tmp_path / "data", {"camera_angle_x": angle}, frames, pixels)
+    source = transforms(tmp_path / "data", {"camera_angle_x": angle, "pl_intensity": 7}, frames, pixels)
     scene = converted("transforms", source, tmp_path / "nerf.xml")
     f = 0.5 * W / np.tan(angle / 2)
     calibration = np.array([[f, 0, W / 2], [0, f, H / 2], [0, 0, 1]])
@@ -117,7 +118,7 @@ def test_transforms_of_nerf(tmp_path):
     lights = scene.photographs.lights
     R, t = list(cameras())[2]
     np.testing.assert_allclose(lights.positions(), [[1, 2, 3], [3, 2, 1], -R.T @ t], rtol=1e-4)
-    np.testing.assert_allclose(lights.rgb(), [[4, 5, 6], [1, 1, 1], [7, 7, 7]], rtol=1e-6)
+    np.testing.assert_allclose(lights.rgb(), [[4, 5, 6], [7, 7, 7], [7, 7, 7]], rtol=1e-6)
     rgb, _, mask, masked, _ = scene.observe([1])
     inside = disc()[..., 0] > 0
     assert masked.all() and (mask[0].numpy() == inside).all()
@@ -273,6 +274,27 @@ def test_a_name_in_a_model_that_is_no_text(colmap, tmp_path, form):
             tmp_path / "new/scan.xml")  # fmt: skip
 
 
+def test_the_largest_of_models_in_sparse_and_below_is_taken(colmap, tmp_path, capsys):
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(colmap / "text"))
+    model.deregister_frame(2)
+    model.write_binary(str(colmap / "sparse"))
+    assert len(converted("colmap", colmap, tmp_path / "scan.xml").shots) == 3
+    said = f"Of COLMAP's models {colmap / 'sparse/0'} is taken, with 3 photographs; not used: {colmap / 'sparse'} (2)"
+    assert said in capsys.readouterr().out
+
+
+def test_names_with_spaces_in_text(colmap, tmp_path):
+    (colmap / "images/sub/2.jpg").rename(colmap / "images/sub/my best photo.jpg")
+    path = colmap / "text/images.txt"
+    path.write_text(path.read_text().replace("sub/2.jpg", "sub/my best photo.jpg"))
+    scene = converted("colmap", colmap / "text", tmp_path / "scan.xml", "--images", colmap / "images")
+    assert [shot.name for shot in scene.shots] == ["sub_1", "sub_3", "sub_my best photo"]
+    for shot, k in zip(scene.shots, (0, 2, 1)):
+        np.testing.assert_allclose(in_scene(shot), by_hand(*list(cameras())[k]), atol=1e-4)
+
+
 def test_a_model_with_a_rotation_that_is_none(colmap, tmp_path):
     path = colmap / "text/frames.txt"
     lines = path.read_text().splitlines()
@@ -299,6 +321,25 @@ def test_colmap_without_masks_and_exif(colmap, tmp_path):
 
 
 # NeuS, IDR, WildLight
+
+
+@pytest.mark.parametrize("mask", ["mask/{:03}.png", "masks/{:03}.png", "mask/m{:03}.png", "mask/{:03}_mask.png", None])
+def test_masks_of_neus_are_found_by_name_or_order_or_in_alpha(tmp_path, mask, capsys):
+    source = neus(tmp_path / "dtu")
+    shutil.rmtree(source / "mask")
+    (source / "image/001.png").unlink()
+    for k in (0, 2):
+        shown = np.roll(disc(), 3 * k, 1)
+        image = source / f"image/{k:03}.png"
+        if mask:
+            write(source / mask.format(k), shown)
+        else:
+            write(image, np.dstack([np.array(Image.open(image)), shown]))
+    scene = converted("neus", source, tmp_path / "dtu.xml")
+    assert [(m == np.roll(disc(), s, 1)[..., 0]).all() for m, s in zip(scene.masks, (0, 6), strict=True)] == [True] * 2
+    for shot, k in zip(scene.shots, (0, 2)):
+        np.testing.assert_allclose(in_scene(shot), by_hand(*list(cameras())[k]) + 0.5, atol=1e-4)
+    assert "1 camera left out, without a photograph" in capsys.readouterr().out
 
 
 def test_neus(tmp_path):
@@ -438,7 +479,7 @@ def test_mistakes_in_cameras_sphere(tmp_path, more, pattern):
 def test_wrong_counts_of_photographs_and_masks(tmp_path):
     source, out = neus(tmp_path / "dtu"), tmp_path / "out/scene.xml"
     (source / "mask/001.png").rename(source / "mask/aside")
-    refused(["neus", source], "no mask for photograph 1", out)
+    refused(["neus", source], "mask: no mask of photograph 1, 001.png; give all or none", out)
     (source / "mask/aside").rename(source / "mask/001.png")
     for k in (3, 4):
         write(source / f"image/{k:03}.png", noise(np.uint8))

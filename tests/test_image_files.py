@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import tifffile
-from helpers.foreign_captures import colmap_folder, converted, transforms
+from helpers.foreign_captures import colmap_folder, converted, disc, noise, transforms
 from PIL import Image, ImageCms, PngImagePlugin
 
-from mi_ring import image_fields, image_headers, images
+from mi_ring import convert, image_fields, image_headers, images
 from mi_ring.colour_profiles import Statement, as_stated, primaries_profile
 from mi_ring.errors import InputError
 from mi_ring.importers.photogrammetry import exposures_of
@@ -402,6 +402,7 @@ def test_associated_alpha_of_tiff_is_undone(tmp_path):
     (lambda path, a: tifffile.imwrite(path.with_suffix(".tif"), np.stack([eight(a)] * 3), photometric="rgb"),
      "has 3 pictures; save the photograph alone"),
     (exr_of("N.X", "N.Y", "N.Z"), "has channels N.X, N.Y, N.Z, but no R, G, B"),
+    (exr_of("X", "Y", "Z"), "has channels X, Y, Z, but no R, G, B"),
     (exr_of("red", "green", "blue"), "but no R, G, B"), (exr_of("Z"), "has channels Z, but no R, G, B"),
     (exr_of("a.R", "a.G", "a.B", "b.R", "b.G", "b.B"), "has the layers a, b; save the one of the photograph alone"),
     (exr_window, r"its data window \(0, 0, 29, 21\) is not its display window \(0, 0, 99, 99\)"),
@@ -414,10 +415,16 @@ def test_associated_alpha_of_tiff_is_undone(tmp_path):
     (by_pillow(".jpg", icc_profile=SRGB_PROFILE[:90]), "colour profile cannot be used"),
     (lambda path, a: path.with_suffix(".png").write_text("P6 2 2 255"), "none of JPEG, PNG, TIFF, OpenEXR, WebP"),
 ])  # fmt: skip
-def test_what_is_not_read_says_so(tmp_path, write, pattern):
+def test_what_is_not_read_says_so_and_is_not_converted(tmp_path, write, pattern):
     write(tmp_path / "a", stripes())
+    file = next(tmp_path.iterdir())
     with pytest.raises(InputError, match=pattern):
-        pixels_of(next(tmp_path.iterdir()), heed=True)
+        pixels_of(file, heed=True)
+    frame = {"file_path": file.name, "transform_matrix": np.eye(4).tolist(), "fl_x": 50}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    with pytest.raises(InputError, match=pattern):
+        convert.main(["transforms", str(tmp_path), str(tmp_path / "s.xml")])
+    assert not (tmp_path / "s.xml").exists()
 
 
 def test_colours_of_palettes_and_their_alpha(tmp_path):
@@ -445,6 +452,40 @@ def test_a_mask_may_be_in_the_alpha_channel_of_its_file():
     assert (images.mask_values(np.dstack([colours, alpha])) == alpha).all()
     opaque = np.dstack([alpha, alpha, alpha, np.full_like(alpha, 255)])
     assert (images.mask_values(opaque) == alpha).all() and (images.mask_values(alpha[..., None]) == alpha).all()
+
+
+def test_the_object_in_a_mask_may_have_any_label_or_colour():
+    shown = np.array([[0, 1, 0], [1, 0, 1]], bool)
+    for kind, label in ((np.uint8, 1), (np.uint8, 128), (np.uint16, 1), (np.uint16, 65535), (np.float32, 0.25)):
+        mask = images.mask_values((shown * label).astype(kind)[..., None])
+        assert mask.dtype == np.uint8 and (mask == 255 * shown).all()
+    for colour in ([0, 255, 0], [0, 0, 200, 255], [255, 0, 0]):
+        assert (images.mask_values((shown[..., None] * colour).astype(np.uint8)) == 255 * shown).all()
+    soft = np.array([[[0], [3], [200]]], np.uint8)
+    assert (images.mask_values(soft) == soft[..., 0]).all()
+
+
+@pytest.mark.parametrize("label", [1, 255])
+@pytest.mark.parametrize("alpha", [False, True])
+def test_masks_are_undistorted_whatever_their_channels(tmp_path, label, alpha):
+    frames = [{"file_path": f"images/{k}.png"} for k in range(3)]
+    top = {"fl_x": 40.0, "fl_y": 44.0, "cx": 28.5, "cy": 27.25, "k1": 0.3}
+    folder = transforms(tmp_path, top, frames, lambda k: noise(np.uint8, seed=k))
+    shown = disc()[..., 0] > 0
+    channels = [shown * label] * 3 + [np.full(shown.shape, 255)] if alpha else [shown * label]
+    for k in range(3):
+        (folder / "masks").mkdir(exist_ok=True)
+        Image.fromarray(np.dstack(channels).astype(np.uint8).squeeze()).save(folder / f"masks/{k}.png")
+    scene = converted("transforms", folder, tmp_path / "s.xml")
+    rows, columns = np.indices(shown.shape) + 0.5
+    x, y = (columns - 28.5) / 40, (rows - 27.25) / 44
+    factor = 1 + 0.3 * (x**2 + y**2)
+    u, v = (
+        (40 * x * factor + 28 - 33),
+        (44 * y * factor + 26.75 - 24),
+    )  # of the disc's centre, about which its radius is
+    clear = np.abs(u**2 + v**2 - 200) > 40
+    assert ((scene.masks[1] > 127) == (u**2 + v**2 < 200))[clear].all()
 
 
 # Exposure

@@ -96,6 +96,18 @@ def test_metashape(tmp_path, kind, terms, where):
         np.testing.assert_allclose(landed(frame), agisoft(R, t, kind, **terms), atol=1e-5)
 
 
+def test_several_chunks_and_components_of_metashape_are_told(tmp_path, capsys):
+    path = metashape(tmp_path)
+    text = path.read_text()
+    chunk = text[text.index("<chunk") : text.index("</chunk>") + len("</chunk>")]
+    fewer = chunk[: chunk.index("<camera ")] + chunk[chunk.index("</camera>") + len("</camera>") :]
+    path.write_text(text.replace(chunk, fewer + chunk.replace("component_id='0'", "component_id='7'", 1)))
+    convert.main(["metashape", str(path), str(tmp_path / "s.xml")])
+    said = capsys.readouterr().out
+    assert "of its 2 chunks number 2 is taken, with 3 photographs; not used: number 1 (2)" in said
+    assert "component_id: photographs are 2 of 0, 1 of 7; components that are not aligned with each other" in said
+
+
 def test_metashape_leaves_out_what_is_disabled(tmp_path):
     path = metashape(tmp_path)
     path.write_text(path.read_text().replace("label='b'", "label='b' enabled='0'"))
@@ -116,6 +128,16 @@ def test_realitycapture_sidecars(tmp_path, model, elements, count):
     assert source.without_pose == {"lost.png"} and [frame.image.name for frame in frames] == NAMES
     for frame, (R, t) in zip(frames, cameras()):
         np.testing.assert_allclose(landed(frame), capturing_reality(R, t, terms), atol=1e-5)
+
+
+def test_sidecars_have_any_case_and_those_without_a_photograph_are_told(tmp_path):
+    folder = sidecars(tmp_path)
+    for file in list(folder.glob("*.xmp")):
+        file.rename(file.with_suffix(".XMP"))
+    (folder / NAMES[1]).unlink()
+    source = RealityCapture(folder, Path())
+    assert [frame.image.name for frame in taken(source)] == [NAMES[0], NAMES[2]]
+    assert source.without_photograph == [Path(NAMES[1]).stem]
 
 
 def test_realitycapture_table(tmp_path):
@@ -328,7 +350,7 @@ def refused(arguments, pattern, folder):
     ("label='b'", "", "camera '1': label: is missing"),
     ("sensor_id='4'", "sensor_id='5'", "sensor_id: is '5'"),
     ("<f>70.0</f>", "", "sensor '4': f: is missing"),
-    ("<f>70.0</f>", "<f>wide</f>", "f: is .*; must be 1 number"),
+    ("<f>70.0</f>", "<f>wide</f>", "f: is .*; must be a number"),
     ("<f>70.0</f>", "<f>nan</f>", "f: has NaN"),
     ("<f>70.0</f>", "<f>-70</f>", "focal lengths above 0"),
     ("<f>70.0</f>", "<f>70</f><k4>0.1</k4>", "k4: is 0.1"),

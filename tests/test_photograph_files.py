@@ -193,11 +193,27 @@ def test_photographs_are_turned_as_their_cameras_are(tmp_path):
         exif[274] = orientation
         write(folder / "m.png", np.ascontiguousarray(turn(upright)[..., :1]))
         Image.fromarray(np.ascontiguousarray(turn(upright))).save(folder / "a.png", exif=exif)
-        frames = [{"file_path": "a.png", "mask_path": "m.png", "transform_matrix": pose.tolist()}]
+        exif[274] = 3  # its size says nothing, but the others' do
+        Image.fromarray(np.ascontiguousarray(upright[::-1, ::-1])).save(folder / "b.png", exif=exif)
+        frames = [{"file_path": "a.png", "mask_path": "m.png", "transform_matrix": pose.tolist()},
+                  {"file_path": "b.png", "transform_matrix": pose.tolist()}]  # fmt: skip
         top = {"fl_x": f[0], "fl_y": f[1], "cx": c[0], "cy": c[1], "w": size[0], "h": size[1], "frames": frames}
         (folder / "transforms.json").write_text(json.dumps(top))
         scene = converted("transforms", folder, tmp_path / f"{orientation}.xml")
-        assert (scene.images[0] == upright).all() and (scene.masks[0] == upright[..., 0]).all()
+        assert all((image == upright).all() for image in scene.images)
+        assert (scene.masks[0] == upright[..., 0]).all()
+
+
+def test_an_orientation_that_changes_no_size_is_not_applied_but_told(tmp_path, capsys):
+    folder = colmap_folder(tmp_path)
+    file = folder / "images/sub/2.jpg"
+    exif = Image.Exif()
+    exif[274] = 3
+    Image.open(file).save(file, exif=exif)
+    stored = np.array(Image.open(file))
+    scene = converted("colmap", folder, tmp_path / "s.xml", "--no-exif")
+    assert (scene.images[1] == stored).all()
+    assert "1 photographs not turned by their EXIF orientation" in capsys.readouterr().out
 
 
 def test_photographs_of_another_size_are_refused_with_what_to_do(tmp_path):
@@ -211,6 +227,33 @@ def test_photographs_of_another_size_are_refused_with_what_to_do(tmp_path):
 
 
 # Masks
+
+
+def test_folders_of_masks_have_any_case_and_others_are_told(tmp_path, capsys):
+    folder = colmap_folder(tmp_path)
+    (folder / "masks").rename(folder / "Masks")
+    assert all(converted("colmap", folder, tmp_path / "a.xml").masks.given)
+    (folder / "Masks/sub").rename(folder / "object_mask")
+    scene = converted("colmap", folder, tmp_path / "b.xml", "--images", folder / "images/sub")
+    assert not any(scene.masks.given) and "object_mask" not in capsys.readouterr().out  # two levels above
+    (folder / "object_mask").rename(folder / "images/object_mask")
+    converted("colmap", folder, tmp_path / "c.xml", "--images", folder / "images/sub")
+    assert "images/object_mask: not used; give --masks if it holds the masks" in capsys.readouterr().out
+
+
+def test_masks_of_reduced_photographs(tmp_path):
+    folder = colmap_folder(tmp_path)
+    shown = Image.open(folder / "masks/sub/1.jpg.png").resize((31, 26), Image.Resampling.NEAREST)
+    for file in (folder / "images/sub").iterdir():
+        for name, picture in (("images_2", Image.open(file).resize((31, 26))), ("masks_2", shown)):
+            (folder / name / "sub").mkdir(parents=True, exist_ok=True)
+            picture.save(folder / name / "sub" / f"{file.name}{'.png' * (name == 'masks_2')}")
+    small = "colmap", folder, tmp_path / "s.xml", "--no-exif", "--images", folder / "images_2"
+    assert all((mask == np.array(shown)).all() for mask in converted(*small).masks)
+    (tmp_path / "s.xml").unlink()
+    shutil.rmtree(folder / "masks_2")
+    with pytest.raises(InputError, match="mask: is 62 x 52 pixels, but its camera 31 x 26; give masks of the size of"):
+        convert.main([str(word) for word in small])
 
 
 @pytest.mark.parametrize("names", ["{}.png", "{}.jpg.PNG", "{}.JPG", "sub/{}.png"])

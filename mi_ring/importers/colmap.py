@@ -45,17 +45,19 @@ class Colmap(Photogrammetry):
     )  # fmt: skip
 
     @staticmethod
-    def model(src: Path) -> Path | None:
-        """Find a COLMAP model in the folder `src`. Returns the folder of the model, or None if there is no model.
+    def models(src: Path) -> list[Path]:
+        """List the folders of models in or below the folder `src`, in the first place that has some."""
+        inside = ([src / "sparse", *(src / "sparse").glob("*")], (src / "colmap/sparse").glob("*"), src.glob("*"))
+        return next((found for places in ([src], *inside) if (found := sorted(filter(is_model, places)))), [])
+
+    @classmethod
+    def model(cls, src: Path) -> Path | None:
+        """Find the model with the most photographs in or below the folder `src`.
 
         The model is in `src` itself, in its folder sparse, or in a folder inside sparse, colmap/sparse or `src`. The
         first of these places that has a model is used. If it has several, the one with the most photographs is used.
         """
-        inside = ((src / inner).glob("*") for inner in ("sparse", "colmap/sparse", "."))
-        for places in ([src], [src / "sparse"], *inside):
-            if models := sorted(filter(is_model, places)):
-                return max(models, key=count_images)
-        return None
+        return max(cls.models(src), key=count_images, default=None)
 
     @property
     def folder(self) -> Path:
@@ -67,11 +69,11 @@ class Colmap(Photogrammetry):
         if model is None:
             raise InputError(f"{self.src}: SRC: neither images.bin nor images.txt, nor a folder sparse/0 with them")
         require_points(model)
-        if model.name.isdigit():
-            others = [folder for folder in sorted(model.parent.iterdir()) if is_model(folder) and folder != model]
-            if sizes := ", ".join(f"{folder} ({count_images(folder)})" for folder in others):
-                self.notes.append(f"Of COLMAP's models {model} is taken, with {count_images(model)} photographs; not "
-                                  f"used: {sizes}")  # fmt: skip
+        siblings = [model.parent, *model.parent.iterdir()] if model == self.src else self.models(self.src)
+        others = [folder for folder in sorted(siblings) if is_model(folder) and folder != model]
+        if sizes := ", ".join(f"{folder} ({count_images(folder)})" for folder in others):
+            self.notes.append(f"Of COLMAP's models {model} is taken, with {count_images(model)} photographs; not used: "
+                              f"{sizes}")  # fmt: skip
         pycolmap = need("pycolmap", f"{model}")
         if size := sum(file.stat().st_size for file in model.glob("*.bin")):
             require_readable(READ_MODEL, model, size, "a COLMAP model")
@@ -79,9 +81,11 @@ class Colmap(Photogrammetry):
             pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # the exception repeats what it logs
             reconstruction = pycolmap.Reconstruction(str(model))
             registered = {*reconstruction.reg_image_ids()}
-            names = sorted((image.name, k) for k, image in reconstruction.images.items())  # fails if not UTF-8
+            names = [(image.name, k) for k, image in reconstruction.images.items()]  # fails if not UTF-8
         except Exception as error:
             raise InputError(f"{model}: not a COLMAP model ({' '.join(str(error).split())})") from error
+        texts = {} if (model / "images.bin").is_file() else names_in(model / "images.txt")
+        names = sorted((texts.get(k, name), k) for name, k in names)
         if not registered:
             raise InputError(f"{model}: images: no photograph has a pose")
         for name, k in names:
@@ -107,15 +111,21 @@ def is_model(folder: Path) -> bool:
     return any((folder / name).is_file() for name in ("images.bin", "images.txt"))
 
 
-def camera_lines(path: Path) -> Iterator[tuple[int, list[bytes]]]:
-    """Yield (line number, words) of each line of 2-D points in images.txt.
+def camera_lines(path: Path) -> Iterator[tuple[bytes, int, list[bytes]]]:
+    """Yield for each camera in images.txt: its line, and (line number, words) of its line of 2-D points.
 
     In this file, two lines describe a camera. The line of 2-D points is the second.
     """
     lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
     for number, line in lines:
         if line.strip() and not line.lstrip().startswith(b"#"):
-            yield number + 1, next(lines, (0, b""))[1].split()
+            yield line, number + 1, next(lines, (0, b""))[1].split()
+
+
+def names_in(path: Path) -> dict[int, str]:
+    """Read the photographs' names in images.txt, by IMAGE_ID. COLMAP itself reads a name up to its first space only."""
+    words = (line.split(maxsplit=9) for line, _, _ in camera_lines(path))
+    return {int(own[0]): own[9].decode().rstrip() for own in words if len(own) == 10}
 
 
 def count_images(folder: Path) -> int:
@@ -135,7 +145,7 @@ def require_points(folder: Path) -> None:
     """
     if (folder / "images.bin").is_file():
         return
-    for number, words in camera_lines(path := folder / "images.txt"):
+    for _, number, words in camera_lines(path := folder / "images.txt"):
         if len(words) % 3 or not all(map(NUMBER.fullmatch, words[:30])):
             raise InputError(f"{path}: line {number}: must be the points of the camera in the line before; put an "
                              "empty line after each camera")  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.image_fields import unused_fields
-from mi_ring.image_headers import KINDS, encodings
+from mi_ring.image_headers import KINDS, encoding_of, encodings
 from mi_ring.importers.frames import Frame, Source, adapt_all, frames_of, require_frames
 from mi_ring.importers.named_photographs import counted, few
 from mi_ring.importers.photograph_files import parts_of, stem_of
@@ -34,6 +34,9 @@ def write_scene(source: Source) -> list[Frame]:
     require_most(source, frames)
     adapt_all(source, frames)
     require_frames(frames, source.src)
+    for frame in frames:
+        if frame.pixels is None and "auto" == source.encoding == frame.encoding:
+            read_as(frame.image, "image", encoding_of)  # refuses HDR curves and unknown profiles
     # Scene files take a $ for a parameter.
     names = [(frame.name or frame.image.stem).replace("$", "_") for frame in frames]
     if len({*names, "object"}) <= len(names):

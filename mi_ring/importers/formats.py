@@ -19,7 +19,7 @@ from mi_ring.importers.opensfm import OpenSfm
 from mi_ring.importers.photogrammetry import Photogrammetry
 from mi_ring.importers.polycam import Polycam
 from mi_ring.importers.reading import list_images, load_json, load_xml
-from mi_ring.importers.realitycapture import POSE, RealityCapture, read_csv, xmp_fields
+from mi_ring.importers.realitycapture import POSE, RealityCapture, read_csv, sidecars_in, xmp_fields
 from mi_ring.importers.record3d import Record3D
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
@@ -53,8 +53,10 @@ def has_files(*names: str) -> Callable[[Path], bool]:
 
 
 def has_sidecars(folder: Path) -> bool:
-    """Return whether a folder contains an XMP sidecar with a camera pose."""
-    return any(accepts(lambda path: "Rotation" in xmp_fields(load_xml(path)), file) for file in folder.glob("*.xmp"))
+    """Test whether a folder contains an XMP sidecar with a camera pose."""
+    return any(
+        accepts(lambda path: "Rotation" in xmp_fields(load_xml(path)), file) for file in sidecars_in(folder).values()
+    )
 
 
 def has_keyframes(folder: Path) -> bool:

@@ -20,6 +20,7 @@ from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 
+TURNED = "photographs turned upright by EXIF, as their cameras are"
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: from OpenGL's camera axes (x right, y up, z back) to OpenCV's
 
 
@@ -144,7 +145,7 @@ def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
         size[::-1] == frame.lens.size or is_scaled(size[::-1], frame.lens.size)
     ):  # fmt: skip
         frame.orientation, size = orientation, size[::-1]
-        done = "photographs turned upright by EXIF, as their cameras are"
+        done = TURNED
     if size != frame.lens.size and is_scaled(size, frame.lens.size):
         done += "; " * bool(done) + "cameras scaled from {} x {} to the {} x {} pixels of their photographs".format(
             *frame.lens.size, *size)  # fmt: skip
@@ -153,8 +154,22 @@ def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
 
 
 def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
-    """Call `adapt` for all frames that have an image file of their own. Adds its messages to `source.notes`."""
-    done = [adapt(f, image_size(f.image), orientation_of(f.image)) for f in frames if f.pixels is None]
+    """Call `adapt` for all frames. Its messages are added to the notes of `source`.
+
+    If the sizes show that some photographs must be turned by their EXIF orientation, all are: a turn by 180 degrees
+    changes no size.
+    """
+    files = [frame for frame in frames if frame.pixels is None]
+    turns = [orientation_of(frame.image) for frame in files]
+    done = [adapt(frame, image_size(frame.image), turn) for frame, turn in zip(files, turns)]
+    rest = [k for k, turn in enumerate(turns) if turn > 1 == files[k].orientation]
+    if any(frame.orientation > 1 for frame in files):
+        for k in rest:
+            if turns[k] <= 4:
+                files[k].orientation, done[k] = turns[k], "; ".join(filter(None, [TURNED, done[k]]))
+    elif rest:
+        source.notes.append(f"{len(rest)} photographs not turned by their EXIF orientation: cameras are taken to be of "
+                            "the pixels as stored")  # fmt: skip
     source.notes.extend(f"{count} {what}" for what, count in Counter(filter(None, done)).items())
 
 
@@ -173,6 +188,8 @@ def require_frames(frames: Sequence[Frame], source: Path) -> None:
             if frame.orientation > 4 and size == frame.lens.size[::-1]:
                 continue  # is turned when it is written
             why = "give photographs of the size of the cameras, or reduced ones"
+            if kind == "mask":
+                why = f"give masks of the size of the photographs, for {frame.image.name}"
             if size == frame.lens.size[::-1]:
                 why = "the sides are exchanged: give the photographs as the other tool read them, turned or not turned"
             sizes = *size, *frame.lens.size

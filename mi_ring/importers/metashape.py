@@ -1,5 +1,6 @@
 """Agisoft Metashape's cameras."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from xml.etree import ElementTree
@@ -66,14 +67,17 @@ class Metashape(Photogrammetry):
     )
 
     def posed(self) -> Iterator[Frame]:
-        chunk = find_chunk(load_xml(self.src))
-        if chunk is None:
+        root = load_xml(self.src)
+        if find_chunk(root) is None:
             raise InputError(f"{self.src}: SRC: is no <document> with a <chunk>; must be what File > Export > Export "
                              "Cameras of Metashape writes as Agisoft XML")  # fmt: skip
+        chunks = root.findall("chunk")
+        chunk = chunks[self.largest([[*own.iterfind("cameras//camera/transform")] for own in chunks], "chunks")]
         self.tell_unused(self.src, xml_names(chunk, self.fields.closed))
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
         components = {component.get("id"): component for component in chunk.iterfind("components/component")}
         cameras = {camera.get("id"): camera for camera in chunk.iterfind("cameras//camera")}
+        counts: Counter = Counter()
         for camera in chunk.iterfind("cameras//camera"):
             label = camera.get("label")
             what = f"{self.src}: camera {(label or camera.get('id'))!r}"
@@ -93,6 +97,7 @@ class Metashape(Photogrammetry):
                 pose = pose @ in_rig(sensor, master, f"{self.src}: sensor {sensor.get('id')!r}")
             # Old versions write no components, new ones no transform of the chunk.
             component = components.get(master.get("component_id"))
+            counts[master.get("component_id")] += 1
             transform = first_child("transform", component, chunk)
             if transform is not None:
                 if master is not camera and numbers(transform, "scale", (1,), what, np.ones(1))[0] != 1:
@@ -102,6 +107,10 @@ class Metashape(Photogrammetry):
             if image := self.photograph(label, what):
                 lens = lens_of(sensor, f"{self.src}: sensor {sensor.get('id')!r}")
                 yield Frame(image, lens, pose, said=label)
+        if len(counts) > 1:
+            sizes = ", ".join(f"{count} of {name}" for name, count in counts.most_common())
+            self.notes.append(f"{self.src}: component_id: photographs are {sizes}; components that are not aligned "
+                              "with each other have places of their own: export one of them alone")  # fmt: skip
 
 
 def find_chunk(root: ElementTree.Element) -> ElementTree.Element | None:

@@ -1,6 +1,7 @@
 """Base class of formats in which the camera file names the image file of each photograph."""
 
 import os
+import re
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +12,8 @@ from mi_ring.errors import InputError, is_file
 from mi_ring.importers.frames import Frame, Source
 from mi_ring.importers.photograph_files import MASKS, PhotographFiles, name_of, refuse_twins
 from mi_ring.importers.reading import first_file, has_alpha, images_below
+
+MASK_LIKE = re.compile("mask|segment|matte|alpha", re.IGNORECASE)  #: in the names of folders that may hold masks
 
 
 @dataclass(frozen=True)
@@ -133,10 +136,17 @@ class NamedPhotographs(Source):
             for frame in frames:
                 if frame.mask is None and has_alpha(frame.image):
                     frame.mask = frame.image
-            if all(frame.mask for frame in frames):
+            if all(frame.mask for frame in frames):  # or none at all
                 return
-            places = dict.fromkeys(place / name for place in (root.parent, root) for name in MASKS)
-            folder = next((place for place in places if place.is_dir() and place != root), None)
+            end = root.name.removeprefix("images") if root.name.startswith("images") else ""  # of images_2
+            beside = [place for above in (root.parent, root) for place in sorted(above.glob("[!.]*")) if place.is_dir()]
+            usual = {f"masks{end}": None} | dict.fromkeys(MASKS)
+            known = [place for name in usual for place in beside if place.name.lower() == name and place != root]
+            folder = next(iter(known), None)
+            stem = frames[0].image.stem
+            like = [place for place in beside if MASK_LIKE.search(place.name) and place not in (root, *known)]
+            if others := [place for place in like if any(f.name.startswith(stem) for f in place.glob("*"))]:
+                self.notes.append(f"{', '.join(map(str, others[:3]))}: not used; give --masks if it holds the masks")
         if folder is None:
             return
         masks = PhotographFiles(images_below(folder), folder)

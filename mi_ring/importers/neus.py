@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -11,15 +12,16 @@ from mi_ring.fields import Fields
 from mi_ring.foreign import load_npy, load_npz
 from mi_ring.importers.camera_models import decompose_projection, pinhole_lens
 from mi_ring.importers.frames import Frame, Source
-from mi_ring.importers.reading import entry, first_file, image_size, matrix, numbered_images
+from mi_ring.importers.photograph_files import MASKS
+from mi_ring.importers.reading import entry, first_file, has_alpha, image_size, matrix, numbered_images
 
 
 @dataclass(frozen=True)
 class Neus(Source):
     """IDR, NeuS, WildLight: cameras_sphere.npz or cameras.npz, folders image and mask. The light is at the camera.
 
-    SRC is the folder. WildLight's light_energy_* become light intensities. WildLight's photographs without flash are
-    left out.
+    SRC is the folder. Without a folder of masks, alpha channels are the masks. WildLight's light_energy_* become light
+    intensities. WildLight's photographs without flash are left out.
     """
 
     fields = Fields(
@@ -47,20 +49,22 @@ class Neus(Source):
             images = dict.fromkeys(numbers, array)
         elif not images:
             raise InputError(f"{self.src}: image: no photographs in this folder, and no images.npy")
-        masks = numbered_images(self.src / "mask")
         energies = any(key.startswith("light_energy_") for key in cameras)
         if not set(images) <= set(numbers):  # the names are not the cameras' numbers: match them by order
             if len(images) != len(numbers):
-                raise InputError(f"{path}: world_mat: there are {len(numbers)}, but {len(images)} photographs")
-            images, masks = (dict(zip(numbers, [files[n] for n in sorted(files)])) for files in (images, masks))
+                raise InputError(f"{path}: world_mat: there are {len(numbers)}, but {len(images)} photographs in "
+                                 f"{self.src / 'image'}; must be as many")  # fmt: skip
+            images = dict(zip(numbers, [images[n] for n in sorted(images)]))
+        self.without_photograph.extend(f"world_mat_{k}" for k in numbers if k not in images)
+        masks = self.masks(images)
         for k, image in images.items():
             pixels = stack[numbers.index(k)].astype(np.float32) if image == array else None
             size = image_size(image) if pixels is None else pixels.shape[1::-1]
             what = f"{path}: world_mat_{k}"
             K, pose = decompose_projection(entry(cameras, f"world_mat_{k}", (4, 4), path)[:3], what)
             frame = Frame(image, pinhole_lens(K, size, 0.5, what), pose, masks.get(k), name=f"{k:03}", pixels=pixels)
-            if masks and not frame.mask:
-                raise InputError(f"{self.src / 'mask'}: no mask for photograph {k}; give all or none")
+            if not masks and pixels is None and has_alpha(image):
+                frame.mask = image
             if energies:
                 energy = np.ravel(cameras.get(f"light_energy_{k}", 0.0))
                 energy = matrix(np.repeat(energy, 3) if len(energy) == 1 else energy, (3,), f"{path}: light_energy_{k}")
@@ -74,3 +78,20 @@ class Neus(Source):
                     if frame.saturation <= 0:
                         raise InputError(f"{path}: max_intensity: is {frame.saturation}; must be positive")
             yield frame
+
+    def masks(self, images: dict[int, Path]) -> dict[int, Path]:
+        """Find the masks of the photographs `images`, by their numbers; empty without masks.
+
+        Masks have the names of the photographs, or are as many in the same order. Raises InputError if one is missing.
+        """
+        folder = next((place for name in MASKS if (place := self.src / name).is_dir()), self.src / "mask")
+        files = numbered_images(folder)
+        by_name = {file.stem: file for file in files.values()}
+        found = {k: by_name[image.stem] for k, image in images.items() if image.stem in by_name}
+        if len(found) < len(images) == len(files):
+            found = dict(zip(sorted(images), [files[n] for n in sorted(files)]))
+        if files and (missing := sorted(images.keys() - found)):
+            raise InputError(
+                f"{folder}: no mask of photograph {missing[0]}, {images[missing[0]].name}; give all or none"
+            )
+        return found

@@ -135,7 +135,7 @@ def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
         array = np.array(np.nan)
     if array.shape != shape or (array.ndim == 0 and np.isnan(array)):
         found = "missing" if values is None else f"of shape {array.shape}" if array.size > 1 else str(values)[:60]
-        wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+        wanted = f"{' x '.join(map(str, shape))} numbers" if shape not in ((), (1,)) else "a number"
         raise InputError(f"{what}: is {' '.join(found.split())}; must be {wanted}")
     if not np.isfinite(array).all():
         raise InputError(f"{what}: has NaN or infinite numbers")

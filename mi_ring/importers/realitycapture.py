@@ -59,19 +59,22 @@ class RealityCapture(Photogrammetry):
 
     def from_sidecars(self) -> Iterator[Frame]:
         """Yield the photographs that have a sidecar with a pose. The sidecar of x.jpg is x.xmp in the folder SRC."""
-        if not any(self.src.glob("*.xmp")):
+        if not (sidecars := sidecars_in(self.src)):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
         images = list_images(self.images or (self.src if list_images(self.src) else self.folder))
         said: dict[str, None] = {}
         for image in images if self.photographs is None else self.photographs:
-            path = self.src / f"{image.stem}.xmp"
-            fields = xmp_fields(load_xml(path)) if path.is_file() else {}
+            path = sidecars.get(image.stem)
+            fields = xmp_fields(load_xml(path)) if path else {}
             said.update((f"xcr:{name}", None) for name in fields)
             if "Rotation" in fields and "Position" in fields:
                 yield sidecar_frame(image, fields, str(path))
             else:
                 self.without_pose.add(image.name)
+        if self.photographs is None:
+            lost = sorted(sidecars.keys() - {image.stem for image in images})
+            self.without_photograph.extend(name for name in lost if "Rotation" in xmp_fields(load_xml(sidecars[name])))
         self.tell_unused(self.src, said)
 
     def from_csv(self) -> Iterator[Frame]:
@@ -96,6 +99,11 @@ class RealityCapture(Photogrammetry):
             terms, centre = ([numbers.get(name, 0.0) for name in names] for names in (TERMS, ("px", "py")))
             lens = film_lens(image, numbers["f"], centre, terms, what)
             yield Frame(image, lens, pose, said=cells["name"])
+
+
+def sidecars_in(folder: Path) -> dict[str, Path]:
+    """List the XMP sidecars in a folder: path by name of the photograph without suffix. Hidden ones are left out."""
+    return {path.stem: path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() == ".xmp"}
 
 
 def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:

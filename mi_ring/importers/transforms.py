@@ -50,7 +50,7 @@ class Transforms(NamedPhotographs):
             "applied_transform applied_scale": "what was done to the poses already",
             "orientation_override auto_scale_poses_override": "what would be done to the poses",
             "depth_path depth_file_path normal_path normal_file_path semantics_path": "other maps",
-            "enable_depth_loading integer_depth_scale depth_unit_scale_factor enable_ray_loading": "other maps",
+            "enable_depth_* integer_depth_scale depth_unit_scale_factor enable_ray_loading": "other maps",
             "n_frames n_extra_learnable_dims envmap_resolution wants_importance_sampling": "settings of a method",
             "train_filenames val_filenames test_filenames": "lists of photographs; all are used",
             "rotation time timestamp sharpness blur_score": "of the animation that made the photograph, or its quality",
@@ -88,16 +88,16 @@ class Transforms(NamedPhotographs):
                 pose = pose @ OPENGL
             said.update(dict.fromkeys(fields))
             camera = transforms_camera(fields, image, f"{path}: {where}")
-            mask = own.get("mask_path")
+            mask = fields.get("mask_path")
             frame = Frame(image, camera, pose, said=name)
             if mask is not None:
                 frame.mask = self.mask_at(str(mask), f"{path}: {where}.mask_path")
             intensity = np.ones(3)
-            if (rgb := own.get("pl_intensity")) is not None:
+            if (rgb := fields.get("pl_intensity")) is not None:
                 rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb
                 intensity = matrix(rgb, (3,), f"{path}: {where}.pl_intensity")
                 frame.light = frame.at_camera(intensity)
-            if (position := own.get("pl_pos")) is not None:
+            if (position := fields.get("pl_pos")) is not None:
                 frame.light = Light("point", matrix(position, (3,), f"{path}: {where}.pl_pos"), intensity)
             yield frame
         self.tell_unused(path, said)

@@ -15,7 +15,7 @@ import scipy.ndimage
 from mi_ring.capture.decoding import is_linear
 from mi_ring.errors import InputError
 from mi_ring.image_headers import bits_of
-from mi_ring.images import oriented, write_image
+from mi_ring.images import mask_values, oriented, write_image
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.reading import image_size, pixels_of
 from mi_ring.importers.undistortion import undistort
@@ -117,7 +117,7 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
         turned = turn > 1 and image_size(file) != frame.lens.size
         if straight and not frame.fill_mask and not turned:
             return None
-        mask = oriented(pixels_of(file), turn if turned else 1)
+        mask = oriented(mask_values(pixels_of(file)), turn if turned else 1)[..., None]
         if frame.fill_mask:
             mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
         return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]

@@ -11,6 +11,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.hull import Hull, Silhouette, evenly_spaced, subsample
 
 CONFORMS = 0.9  #: least share of a mask that the others must agree with
+AROUND = 0.9  #: share of a photograph's border above which a mask is that of the background
 
 
 def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
@@ -40,6 +41,10 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
             else:
                 why = "cameras or masks are wrong"
     wrong = [f"The masks agree to {agree.mean():.0%} only: {why}"] if why else []
+    if not why and capture.whole and np.median([border(silhouette.whole) for silhouette in silhouettes]) > AROUND:
+        wrong = [
+            "masks cover the border of most photographs: are they inverted? 255 is to be the object, 0 the background"
+        ]
     return {silhouette.name: float(a) for silhouette, a in zip(silhouettes, agree)}, wrong
 
 
