@@ -34,15 +34,15 @@ def parse(
 ) -> Any:  # fmt: skip
     """An instance of a dataclass, from the command line. Raises InputError for wrong arguments.
 
-    The help begins with `description`, by default the docstring of the dataclass. With `needs_llvm`, also raises
-    InputError if there is no LLVM, but not for --help.
+    The help, by --help or --help-all, begins with `description`, by default the docstring of the dataclass. With
+    `needs_llvm`, also raises InputError if there is no LLVM, but not for the help.
     """
     for word in (*arguments, os.getcwd()):
         require_utf8(word)
-    box = io.StringIO()
+    words, box = ["--help" if word == "--help-all" else word for word in arguments], io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            config = tyro.cli(config_type, args=list(arguments), prog=program, default=default, description=description)
+            config = tyro.cli(config_type, args=words, prog=program, default=default, description=description)
     except SystemExit as stop:
         if not stop.code:
             raise
