@@ -22,7 +22,8 @@ from mi_ring.scene.shot import Encoding, Files, Shot
 from mi_ring.system.files import writing
 
 FLATTEST = 8  #: largest ratio of a photograph's sides
-NAME = re.compile(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]*")  #: of a photograph, which is also the name of its files
+#: Of a photograph, which is also the name of its files. XML lacks some characters, and $ begins Mitsuba's variables.
+NAME = re.compile(r"(?!\.)[^/\\$\x00-\x1f\ud800-\udfff\ufffe\uffff]+")
 
 Item = TypeVar("Item")
 
@@ -34,7 +35,7 @@ def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarra
     """
     if encoding not in ("auto", "srgb", "linear"):
         raise InputError(f"encoding: is {encoding!r}, must be one of auto, srgb, linear")
-    found = [image_of(image, encoding, f"images[{k}]") for k, image in enumerate(images)]
+    found = [image_of(image, encoding, f"images[{k}]") for k, image in enumerate(listed(images, "images"))]
     if not found:
         raise InputError("images: is empty; give one array for each photograph")
     return found
@@ -66,12 +67,28 @@ def shots_of(
     )  # fmt: skip
 
 
+def listed(items: Iterable[Item], what: str) -> list[Item]:
+    """Return the items as a list. Raises InputError, which begins with `what`, if they are none."""
+    try:
+        return list(items)
+    except TypeError:
+        raise InputError(f"{what}: is {type(items).__name__}; must be a list, one item for each photograph") from None
+
+
+def array_of(value: ArrayLike, what: str) -> np.ndarray:
+    """Return an array of any type and shape. Raises InputError, which begins with `what`, if rows differ in length."""
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{what}: is no array ({str(error).partition('.')[0]})") from error
+
+
 def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item | None]:
     """Return one item per photograph; a list of None if `items` is None.
 
     Raises InputError unless there are `count` items.
     """
-    found: list[Item | None] = [None] * count if items is None else list(items)
+    found: list[Item | None] = [None] * count if items is None else listed(items, what)
     if len(found) != count:
         raise InputError(f"{what}: has {len(found)} for {count} images; give one for each")
     return found
@@ -82,7 +99,7 @@ def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
 
     Raises InputError if invalid; `what` begins the message.
     """
-    array = np.asarray(image)
+    array = array_of(image, what)
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 3 or array.shape[2] != 3 or not array.size:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be (H, W, 3) of uint8, uint16 or "
                          "float32")  # fmt: skip
@@ -102,7 +119,7 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
     """
     if mask is None:
         return None
-    array = np.asarray(mask)
+    array = array_of(mask, what)
     if array.dtype not in (np.uint8, bool) or array.shape != image.shape[:2]:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be {image.shape[:2]} of bool, or of "
                          "uint8 from 0 to 255")  # fmt: skip
@@ -170,7 +187,7 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
         return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
     for k, name in enumerate(one_each(names, count, "names")):
         if not isinstance(name, str) or not NAME.fullmatch(name) or name == "object":
-            raise InputError(f'names[{k}]: is {name!r}; must be a file name without suffix, not "object"')
+            raise InputError(f'names[{k}]: is {name!r}; must be a file name without suffix and $, not "object"')
         if name in names[:k]:
             raise InputError(f"names[{k}]: {name!r} occurs twice")
     return list(names)
@@ -178,7 +195,7 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
 
 def room_of(room: ArrayLike) -> np.ndarray:
     """Pad spherical harmonics (n, 3) of a room's light with zeros to (BASIS, 3). Raises InputError for a wrong n."""
-    array, counts = np.asarray(room, float), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
+    array, counts = array_of(room, "room"), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
     if array.ndim != 2 or array.shape[0] not in counts:
         raise InputError(f"room: is of shape {array.shape}; must be (n, 3), n one of {', '.join(map(str, counts))}")
     found = numbers(array, (len(array), 3), "room").astype(float)
