@@ -23,6 +23,9 @@ WEIGHTS = {
     "normal_variation": 0.0, "material_rank": 0.0,
 }  # fmt: skip
 
+#: Largest values of settings. Far below them, memory or patience ends.
+MOST = {"iterations": 10**6, "steps": 10**4, "batch": 10**6, "spp": 10**4}
+
 #: What `Config.refine` may have.
 Unknown = Literal[
     "auto", "none", "cameras", "focal", "principal", "distortion", "light", "power", "gain", "falloff", "vignetting",
@@ -202,8 +205,8 @@ class Config(Ablation, Tuning, Common):
             object.__setattr__(self, "domain", ("mesh", Path(self.domain[1])))
         else:
             require(self.domain in ("auto", "sphere", "hull"), "domain", "auto, sphere, hull or (mesh, FILE)")
-        for name in ("iterations", "steps", "batch", "spp"):
-            require(getattr(self, name) >= 1, name, "at least 1")
+        for name, most in MOST.items():
+            require(1 <= getattr(self, name) <= most, name, f"1 to {most:,}")
         require(1 <= self.frequencies <= 64, "frequencies", "1 to 64")
         require(self.encoding != "octaves" or self.frequencies <= 16, "frequencies", "1 to 16 for octaves")
         require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
@@ -216,7 +219,7 @@ class Config(Ablation, Tuning, Common):
         for name in ("widths", "shares"):
             value = getattr(self, name)
             require(len(value) == len(self.levels), name, f"as many values as --levels ({len(self.levels)})")
-            require(all(0 < v < math.inf for v in value), name, "above 0")
+            require(all(v > 0 for v in value) and sum(value) < math.inf, name, "above 0")
         object.__setattr__(self, "weights", WEIGHTS | self.weights)
         for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
