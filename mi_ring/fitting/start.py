@@ -1,16 +1,21 @@
 """The start of a fit: its networks, the surface that is deformed, and the sphere that normalises it."""
 
+import contextlib
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.lighting import Lighting
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import Refinement
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
@@ -19,12 +24,16 @@ from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
 from mi_ring.nets.resnet import shape_net_of
 from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_of
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.system.optional import installed
 
 
 def require_settings(capture: Capture, config: Config) -> None:
-    """Raise InputError if a setting contradicts the capture."""
+    """Raise InputError if a setting contradicts the capture, or if one of them is something else."""
+    for name, value, kind in (("capture", capture, Capture), ("config", config, Config)):
+        if not isinstance(value, kind):
+            raise InputError(f"{name}: is {type(value).__name__}, must be a mi_ring.{kind.__name__}")
     if not capture.images:
         raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
     if {"curve", "contrast"} & set(config.refine) and any(shot.files.ambient for shot in capture.shots):
@@ -36,6 +45,28 @@ def require_settings(capture: Capture, config: Config) -> None:
     if "lamps" in config.refine and config.light != "lamps" and not lamps_of(capture.scene):
         raise InputError(f"{capture.path}: emitter: --refine lamps: the scene has none, point or directional, beside "
                          "the photographs' own lights; leave it out, or find them all by --light lamps")  # fmt: skip
+
+
+class StateError(InputError):
+    """The state of another fit, or of none."""
+
+
+@contextlib.contextmanager
+def restoring() -> Iterator[None]:
+    """Context manager that turns the errors of a wrong state of a fit into StateError."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise StateError("state: is of a fit with other settings, networks or photographs, or of none "
+                         f"({error!r})") from error  # fmt: skip
+
+
+def restored(state: dict[str, Any]) -> tuple[Lighting, FittedObject]:
+    """Read lighting and object from the state of a fit. Raises InputError if it is none."""
+    with restoring():
+        return Lighting(*state["lighting"]), ring_of(state["ring"])
 
 
 def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -> FittedObject:
@@ -65,6 +96,8 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
     scale = reflectance / power
     indirect = config.indirect and math.pi * scale < 1
     if networks:
+        if not (isinstance(networks, Sequence) and [isinstance(n, nn.Module) for n in networks] == [True, True]):
+            raise InputError("networks: must be two instances of torch.nn.Module, (Shape-Net, BRDF-Net)")
         for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
             if not hasattr(network, needed):
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
