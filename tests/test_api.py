@@ -1,6 +1,7 @@
 """The Python API: what `mi_ring` itself offers, and nothing else of the package."""
 
 import json
+import math
 import subprocess
 import sys
 
@@ -313,3 +314,28 @@ def test_terms_that_would_change_nothing_or_everything_are_told_by_name(capture)
     fit = mi_ring.Fit(capture, config(iterations=30, levels=(1,), widths=(28,), shares=(1.0,)), terms=terms)
     with pytest.raises(mi_ring.InputError, match="diverged at iteration [0-9]+ by the term mine; try"):
         fit.run()
+
+
+def test_cameras_lights_and_levels_that_are_none_are_refused(finished):
+    ring = mi_ring.load_fit(finished)
+    shot = mi_ring.load_capture(finished / "scene.xml", images=False).shots[0]
+    camera, light = shot.camera, shot.own_light
+    for changes, words in (
+        ({"camera": camera.to_world}, "camera: is ndarray; must be a mi_ring.Camera"),
+        ({"camera": camera._replace(size=(56.5, 40))}, r"camera: size is \(56.5, 40\); must be whole numbers"),
+        ({"camera": camera._replace(size=(0, 40))}, "camera: size is"),
+        ({"camera": camera._replace(focal=np.array([math.nan, 60]))}, "camera: focal: must be finite"),
+        ({"camera": camera._replace(to_world=camera.to_world @ np.diag([-1, 1, 1, 1]))}, "without scale or mirror"),
+        ({"camera": camera._replace(to_world=camera.to_world.T)}, "is it transposed"),
+        ({"camera": camera._replace(distortion=-9.0)}, "camera: distortion is -9"),
+        ({"light": mi_ring.Light("spot", light.vector, light.rgb)}, 'light: is of kind "spot"'),
+        ({"light": light._replace(rgb=-light.rgb)}, "light: .* strong, must be positive"),
+        ({"spp": 0}, "spp: is 0, must be a whole number from 1 to 10,000"),
+        ({"level": 1.5}, "level: is 1.5, must be a whole number from 0 to 10"),
+    ):
+        with pytest.raises(mi_ring.InputError, match=words):
+            ring.render(**{"camera": camera, "light": light, "spp": 1, "level": 1} | changes)
+    with pytest.raises(mi_ring.InputError, match="ring: is str; must be a fitted object"):
+        mi_ring.export(str(finished), "a.ply")
+    with pytest.raises(mi_ring.InputError, match="--subdivisions: is 1.5, must be 0 to 10"):
+        mi_ring.export(ring, "a.ply", subdivisions=1.5)

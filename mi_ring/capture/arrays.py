@@ -12,12 +12,11 @@ from numpy.typing import ArrayLike
 from mi_ring.capture.decoding import is_linear
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import photograph_element, room_elements, scene_bytes, scene_element
-from mi_ring.errors import InputError
-from mi_ring.geometry.camera import Camera
+from mi_ring.errors import LARGEST, InputError, require_numbers
+from mi_ring.geometry.camera import Camera, usable_camera
 from mi_ring.images import write_image
-from mi_ring.plugins.properties import LARGEST
 from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER
-from mi_ring.scene.lights import Light
+from mi_ring.scene.lights import Light, usable_light
 from mi_ring.scene.shot import Encoding, Files, Shot
 from mi_ring.system.files import writing
 
@@ -56,12 +55,12 @@ def shots_of(
 ) -> tuple[Shot, ...]:  # fmt: skip
     """Make the `Shot` of each image. Arguments: as for `Capture.from_arrays`. Raises InputError if one is invalid."""
     count = len(images)
-    full = float(numbers(saturation, (), "saturation"))
+    full = float(require_numbers(saturation, (), "saturation"))
     if not full > 0:
         raise InputError(f"saturation: is {saturation}, must be above 0")
     columns = names_of(names, count), images, one_each(cameras, count, "cameras"), one_each(lights, count, "lights")
     return tuple(
-        Shot(name, camera_of(camera, image, f"cameras[{k}]"), light_of(light, f"lights[{k}]"), encoding=encoding,
+        Shot(name, camera_of(camera, image, f"cameras[{k}]"), usable_light(light, f"lights[{k}]"), encoding=encoding,
              saturation=full, calibrated=calibrated)
         for k, (name, image, camera, light) in enumerate(zip(*columns))
     )  # fmt: skip
@@ -130,52 +129,10 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
 
 def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
     """Check the camera of an image and round its numbers to float32. Raises InputError; `what` begins the message."""
-    if not isinstance(camera, Camera):
-        raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
-    to_world, focal, centre, distortion = (
-        numbers(getattr(camera, name), shape, f"{what}: {name}")
-        for name, shape in (("to_world", (4, 4)), ("focal", (2,)), ("centre", (2,)), ("distortion", ()))
-    )
-    size = image.shape[1], image.shape[0]
-    own = camera._replace(to_world=to_world, focal=focal, centre=centre, size=size, distortion=float(distortion))
-    if tuple(camera.size) != own.size:
-        raise InputError(f"{what}: size is {tuple(camera.size)}, (width, height); its image is {sides(image)}")
-    if not (own.focal > 0).all():
-        raise InputError(f"{what}: focal is {own.focal}; must be above 0 [px]")
-    if not np.allclose(own.to_world[3], [0, 0, 0, 1]):
-        raise InputError(f"{what}: to_world: its last row is {own.to_world[3]}, must be 0 0 0 1; is it transposed?")
-    if fault := own.fault():
-        raise InputError(f"{what}: {fault}")
+    own, size = usable_camera(camera, what), (image.shape[1], image.shape[0])
+    if own.size != size:
+        raise InputError(f"{what}: size is {own.size}, (width, height); its image is {sides(image)}")
     return own
-
-
-def light_of(light: object, what: str) -> Light | None:
-    """Check a light and round its numbers to float32; None stays None. Raises InputError; `what` begins the message."""
-    if light is None:
-        return None
-    if not isinstance(light, Light) or light.kind not in ("point", "directional"):
-        kind = f'of kind "{light.kind}"' if isinstance(light, Light) else type(light).__name__
-        raise InputError(f"{what}: is {kind}; must be a mi_ring.Light, point or directional, or None")
-    vector, rgb = (numbers(getattr(light, name), (3,), f"{what}: {name}").astype(float) for name in ("vector", "rgb"))
-    if light.kind == "directional" and not vector.any():
-        raise InputError(f"{what}: vector is 0; must be the direction in which the light travels")
-    return Light(light.kind, vector, rgb)
-
-
-def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert a value to a float32 array of this shape.
-
-    Raises InputError, which begins with `what`, if that is impossible.
-    """
-    try:
-        array = np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise InputError(f"{what}: is {type(value).__name__}; must be numbers of shape {shape}") from None
-    if array.shape != shape:
-        raise InputError(f"{what}: is of shape {array.shape}; must be {shape}")
-    if not (np.abs(array) <= LARGEST).all():
-        raise InputError(f"{what}: must be finite, {LARGEST:g} at most")
-    return array.astype(np.float32)
 
 
 def names_of(names: Sequence[str] | None, count: int) -> list[str]:
@@ -198,7 +155,7 @@ def room_of(room: ArrayLike) -> np.ndarray:
     array, counts = array_of(room, "room"), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
     if array.ndim != 2 or array.shape[0] not in counts:
         raise InputError(f"room: is of shape {array.shape}; must be (n, 3), n one of {', '.join(map(str, counts))}")
-    found = numbers(array, (len(array), 3), "room").astype(float)
+    found = require_numbers(array, (len(array), 3), "room").astype(float)
     return np.concatenate([found, np.zeros((BASIS - len(found), 3))])
 
 
@@ -223,8 +180,8 @@ def scene_xml(
     room: ArrayLike | None,
 ) -> bytes:  # fmt: skip
     """Make the content of the scene file for `Capture.from_arrays`. Raises InputError for an invalid argument."""
-    middle = None if center is None else numbers(center, (3,), "center")
-    reach = None if radius is None else float(numbers(radius, (), "radius"))
+    middle = None if center is None else require_numbers(center, (3,), "center")
+    reach = None if radius is None else float(require_numbers(radius, (), "radius"))
     if reach is not None and not reach > 0:
         raise InputError(f"radius: is {radius}, must be above 0")
     elements = [photograph_element(replace(shot, files=own)) for shot, own in zip(shots, files)]

@@ -28,6 +28,8 @@ from mi_ring.objects.ring_file import ring_of
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.system.optional import installed
 
+DISPROPORTIONATE = 20.0  #: ratio of the sizes of the normalising sphere and the start surface that is no choice
+
 
 def require_settings(capture: Capture, config: Config) -> None:
     """Raise InputError if a setting contradicts the capture, or if one of them is something else."""
@@ -76,6 +78,7 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
     """
     capture, config = problem.seen, problem.config
     domain, center, radius = starting_surface(capture, config.domain)
+    require_normalised(capture, domain, center, radius)
     require_view_from_outside(capture, domain, center, radius)
     parameters, bsdf = predicted_parameters(capture, config.parameters)
     if problem.lighting.kind != "capture":
@@ -145,6 +148,18 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
     if surface is not None and (choice == "hull" or installed("gpytoolbox") or genus(surface)):
         return closed_domain(surface, shape.center, shape.radius)
     return Sphere(), *capture.sphere()
+
+
+def require_normalised(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
+    """Raise InputError if the scene's normalising sphere has quite another size than the start surface, or place."""
+    size = float(np.ptp(domain.points, axis=0).max()) / 2
+    if not 1 / DISPROPORTIONATE < size < DISPROPORTIONATE:
+        raise InputError(
+            f"{capture.path}: center and radius of the shapenet shape: are {', '.join(f'{c:.4g}' for c in center)} and "
+            f"{radius:.4g}, but the surface that the fit starts from has a radius of {size * radius:.4g} about "
+            f"{', '.join(f'{c:.4g}' for c in center + radius * (domain.points.min(0) + domain.points.max(0)) / 2)}; "
+            "correct them or leave them out"
+        )
 
 
 def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:

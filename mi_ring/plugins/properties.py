@@ -6,13 +6,12 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.errors import LARGEST
+
 
 def beside_scene(name: str) -> Path:
     """Resolve a file name in a scene relative to the scene's folder; without one, to the working folder."""
     return Path(str(mi.file_resolver()[0])) / name
-
-
-LARGEST = 1e18  #: number whose square is finite in float32
 
 
 def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
