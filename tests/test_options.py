@@ -6,6 +6,7 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mi_ring import fit
@@ -127,3 +128,31 @@ def test_an_unusable_option_is_one_line_that_names_it(options, words):
         fit.parse_options(["scene.xml", *options])
     complaint = str(error.value)
     assert complaint.startswith(words[0]) and "\n" not in complaint and all(word in complaint for word in words)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"iterations": "many"}, "--iterations: is many, must be as mi-ring fit --help-all says"),
+        ({"iterations": 3.5}, "--iterations: is 3.5"),
+        ({"iterations": True}, "--iterations: is True"),
+        ({"levels": 3}, "--levels: is 3"),
+        ({"weights": {"rgb": None}}, "--weights: is rgb None"),
+        ({"parameters": {"roughness": 1}}, "--parameters: is roughness 1"),
+        ({"seed": None}, "--seed: is None"),
+        ({"shadows": "no"}, "--shadows: is no"),
+        ({"domain": ("mesh", 3)}, "--domain: is mesh 3"),
+        ({"learning_rate": 10**400}, "--learning-rate: is 1000"),
+        ({"loss": ["l1"]}, "--loss: is l1, must be one of l2"),
+    ],
+)
+def test_settings_of_another_type_are_refused(settings, words):
+    with pytest.raises(InputError, match=words):
+        Config(**settings)
+
+
+def test_numbers_of_numpy_are_settings_that_can_be_written():
+    config = Config(iterations=np.int64(5), learning_rate=np.float32(0.5), levels=np.array([2]).tolist(), widths=[28],
+                    shares=(np.float64(1),), shadows=np.bool_(False))  # fmt: skip
+    same = {"iterations": 5, "learning_rate": 0.5, "levels": [2], "widths": [28], "shares": [1], "shadows": False}
+    assert config.settings() == Config().settings() | same

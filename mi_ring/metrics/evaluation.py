@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.embedding import inside_out
 from mi_ring.metrics.image_errors import SPP, compare_photographs
@@ -41,6 +42,10 @@ def evaluate(
     in `_held_out` for held-out ones; `views` and `novel_views` list them by photograph. Undefined numbers are missing,
     such as the genus of an open mesh.
     """
+    if spp < 1:
+        raise InputError(f"spp: is {spp}, must be at least 1")
+    if align not in (None, "rigid", "similarity"):
+        raise InputError(f"align: is {align!r}, must be rigid, similarity or None")
     run, mesh = Path(run), Path(mesh)
     ring, capture = load_fit(run), load_capture(run / "scene.xml", width=COMPARED, crop=False)
     unseen = novel and load_capture(novel, width=COMPARED, crop=False)
