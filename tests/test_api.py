@@ -268,7 +268,7 @@ def test_a_fit_goes_on_from_its_state(capture):
     for settings, found in ((config(optimizer="adam"), state), (config(), {"ring": 1}), (config(), "state.pt")):
         with pytest.raises(mi_ring.InputError, match="state: is of a fit with other settings, networks or photographs"):
             mi_ring.Fit(capture, settings, state=found)
-    with pytest.raises(mi_ring.InputError, match="photographs that are not fitted"):
+    with pytest.raises(mi_ring.InputError, match="state: is of a fit with other settings, networks or photographs"):
         mi_ring.Fit(capture.part(range(5)), config(), state=state)
 
 

@@ -19,7 +19,7 @@ class Light(NamedTuple):
     rgb: np.ndarray  #: (3,) intensity [W/sr], or irradiance [W/m²]
 
 
-def usable_light(light: object, what: str) -> Light | None:
+def usable_light(light: Light | None, what: str) -> Light | None:
     """Check a light and round its numbers to float32; None stays None. Raises InputError; `what` begins the message."""
     if light is None:
         return None
