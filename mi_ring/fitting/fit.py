@@ -195,5 +195,5 @@ class Fit(Renamed):
                 self.model.calibration.load_state_dict(state["calibration"])
             for name in PARTS:
                 getattr(self, name).restore(state[name])
-            self.course = Course(**state["course"])
+            self.course = Course.of(state["course"], self.iterations)
             self.capture = with_masks(self.problem.capture, self.course.masks)
