@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_ring import fit
+from mi_ring import export, fit
 from mi_ring.errors import InputError
 from mi_ring.fit_config import FitConfig, Task, parse_options
 from mi_ring.fitting.config import PRESETS, TASK, WEIGHTS, Ablation, Common, Config, Tuning
@@ -40,6 +40,13 @@ def test_help_shows_what_users_set_and_says_how_many_more_options_there_are(caps
     assert everything["weights options"] == {f"weights.{name.replace('_', '-')}" for name in WEIGHTS}
     hidden = sum(map(len, everything.values())) - len(found["options"])
     assert below == f"{hidden} more options, for tuning and ablation: --help-all shows them" != other
+
+
+@pytest.mark.parametrize("arguments", [["--help-all"], ["run", "--help-all"], ["--help"]])
+def test_all_commands_have_both_helps(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        export.main(arguments)
+    assert not stop.value.code and "--subdivisions" in capsys.readouterr().out
 
 
 def test_hidden_options_are_options_all_the_same():

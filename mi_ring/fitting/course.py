@@ -23,7 +23,7 @@ class Course:
 
     @classmethod
     def of(cls, fields: dict[str, Any], iterations: int) -> "Course":
-        """Make the course of a fit of so many iterations that is to go on. Raises an error of Python for wrong fields."""
+        """Make the course of a fit of so many iterations that is to go on. Wrong fields raise errors of Python."""
         course = cls(**fields)
         if not (0 <= course.iteration <= iterations and 0 <= course.seconds < math.inf):
             raise ValueError(f"iteration {course.iteration} after {course.seconds} s")
