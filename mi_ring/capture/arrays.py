@@ -127,7 +127,7 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
     return array if array.dtype == np.uint8 else np.where(array, 255, 0).astype(np.uint8)
 
 
-def camera_of(camera: Camera, image: np.ndarray, what: str) -> Camera:
+def camera_of(camera: Camera | None, image: np.ndarray, what: str) -> Camera:
     """Check the camera of an image and round its numbers to float32. Raises InputError; `what` begins the message."""
     own, size = usable_camera(camera, what), (image.shape[1], image.shape[0])
     if own.size != size:

@@ -149,7 +149,7 @@ class Camera(NamedTuple):
         return None
 
 
-def usable_camera(camera: Camera, what: str) -> Camera:
+def usable_camera(camera: Camera | None, what: str) -> Camera:
     """Check a camera and round its numbers to float32. Raises InputError; `what` begins the message."""
     if not isinstance(camera, Camera):
         raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
