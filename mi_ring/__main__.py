@@ -50,7 +50,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int | None:
 def main() -> None:
     """Run the command that the first argument of the program names, and end the process with its exit status."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
-    if name in ("-h", "--help", "--version"):
+    if name in ("-h", "--help", "--help-all", "--version"):
         run("mi-ring", lambda _: print(__version__ if name == "--version" else overview()), [])
     if name not in COMMANDS:
         alike = "".join(f"; perhaps you meant {other}" for other in difflib.get_close_matches(name, COMMANDS, 1))

@@ -5,6 +5,11 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+LARGEST = 1e18  #: number whose square is finite in float32
+
 
 class InputError(ValueError):
     """Error for input that the user can correct. Commands print its message and exit with status 2.
@@ -44,3 +49,19 @@ def require_range(options: Any, name: str, low: float, high: float = math.inf) -
     if value is not None and not low <= value <= high:
         limits = f"{low} to {high}" if high < math.inf else f"at least {low}"
         raise InputError(f"--{name.replace('_', '-')}: is {value}, must be {limits}")
+
+
+def require_numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Convert a value to a float32 array of this shape.
+
+    Raises InputError, which begins with `what`, if that is impossible.
+    """
+    try:
+        array = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{what}: is {type(value).__name__}; must be numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise InputError(f"{what}: is of shape {array.shape}; must be {shape}")
+    if not (np.abs(array) <= LARGEST).all():
+        raise InputError(f"{what}: must be finite, {LARGEST:g} at most")
+    return array.astype(np.float32)

@@ -86,7 +86,6 @@ def parse_options(arguments: Sequence[str]) -> FitConfig:
     brief = "--help-all" not in arguments and bool({"-h", "--help"} & {*arguments})
     kind, parts = command_line(brief)
     default = built(kind, preset_values | {name: built(part, preset_values) for name, part in parts.items()})
-    arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     try:
         parsed = command.parse(kind, arguments, "mi_ring.fit", default, FitConfig.__doc__, needs_llvm=False)
     except SystemExit:

@@ -1,6 +1,7 @@
 """The Python API: what `mi_ring` itself offers, and nothing else of the package."""
 
 import json
+import math
 import subprocess
 import sys
 
@@ -264,6 +265,11 @@ def test_a_fit_goes_on_from_its_state(capture):
     rest = [it.loss for it in first]
     again = mi_ring.Fit(capture, config(), state=state)
     assert again.iteration == 2 and [it.loss for it in again] == pytest.approx(rest, rel=1e-4)
+    for settings, found in ((config(optimizer="adam"), state), (config(), {"ring": 1}), (config(), "state.pt")):
+        with pytest.raises(mi_ring.InputError, match="state: is of a fit with other settings, networks or photographs"):
+            mi_ring.Fit(capture, settings, state=found)
+    with pytest.raises(mi_ring.InputError, match="state: is of a fit with other settings, networks or photographs"):
+        mi_ring.Fit(capture.part(range(5)), config(), state=state)
 
 
 def test_what_was_frozen_stays_so(capture):
@@ -282,3 +288,54 @@ def test_a_fit_that_looks_at_no_photograph_is_refused(capture):
     for weights in ({"rgb": 0.0, "mask": 0.0}, {"rgb": 0.0, "mask": 0.0, "velocity": 0.0, "normal_variation": 1.0}):
         with pytest.raises(mi_ring.InputError, match="no term compares the surface with the photographs"):
             mi_ring.Fit(capture, config(weights=weights))
+
+
+def test_what_is_no_part_of_a_fit_is_refused_by_name(capture):
+    own = mi_ring.default_terms["rgb"]
+    for arguments, words in (
+        ({"capture": "small.xml"}, "capture: is str, must be a mi_ring.Capture"),
+        ({"config": "fast"}, "config: is str, must be a mi_ring.Config"),
+        ({"terms": [own]}, "terms: is list, must be a dict"),
+        ({"terms": {"rgb": own, "mine": 3}}, "terms: mine: must be a function, or a Term"),
+        ({"terms": {"rgb": own, "mine": own._replace(weight=math.nan)}}, "terms: mine: must be"),
+        ({"terms": {"rgb": own, "mine": own._replace(schedule=0.5)}}, "terms: mine: must be"),
+        ({"networks": (mi_ring.ShapeNet(3),)}, "networks: must be two instances"),
+        ({"networks": mi_ring.ShapeNet(3)}, "networks: must be two instances"),
+        ({"networks": (mi_ring.ShapeNet, mi_ring.BRDFNet)}, "networks: must be two instances"),
+    ):
+        with pytest.raises(mi_ring.InputError, match=words):
+            mi_ring.Fit(**{"capture": capture, "config": config()} | arguments)
+
+
+def test_terms_that_would_change_nothing_or_everything_are_told_by_name(capture):
+    with pytest.raises(mi_ring.InputError, match="terms: still: have no gradients"):
+        mi_ring.Fit(capture, config(), terms={"still": lambda it: it.prediction.rgb.detach().mean()}).step()
+    terms = {**mi_ring.default_terms, "mine": lambda it: it.prediction.rgb.mean() * math.nan}
+    fit = mi_ring.Fit(capture, config(iterations=30, levels=(1,), widths=(28,), shares=(1.0,)), terms=terms)
+    with pytest.raises(mi_ring.InputError, match="diverged at iteration [0-9]+ by the term mine; try"):
+        fit.run()
+
+
+def test_cameras_lights_and_levels_that_are_none_are_refused(finished):
+    ring = mi_ring.load_fit(finished)
+    shot = mi_ring.load_capture(finished / "scene.xml", images=False).shots[0]
+    camera, light = shot.camera, shot.own_light
+    for changes, words in (
+        ({"camera": camera.to_world}, "camera: is ndarray; must be a mi_ring.Camera"),
+        ({"camera": camera._replace(size=(56.5, 40))}, r"camera: size is \(56.5, 40\); must be whole numbers"),
+        ({"camera": camera._replace(size=(0, 40))}, "camera: size is"),
+        ({"camera": camera._replace(focal=np.array([math.nan, 60]))}, "camera: focal: must be finite"),
+        ({"camera": camera._replace(to_world=camera.to_world @ np.diag([-1, 1, 1, 1]))}, "without scale or mirror"),
+        ({"camera": camera._replace(to_world=camera.to_world.T)}, "is it transposed"),
+        ({"camera": camera._replace(distortion=-9.0)}, "camera: distortion is -9"),
+        ({"light": mi_ring.Light("spot", light.vector, light.rgb)}, 'light: is of kind "spot"'),
+        ({"light": light._replace(rgb=-light.rgb)}, "light: .* strong, must be positive"),
+        ({"spp": 0}, "spp: is 0, must be a whole number from 1 to 10,000"),
+        ({"level": 1.5}, "level: is 1.5, must be a whole number from 0 to 10"),
+    ):
+        with pytest.raises(mi_ring.InputError, match=words):
+            ring.render(**{"camera": camera, "light": light, "spp": 1, "level": 1} | changes)
+    with pytest.raises(mi_ring.InputError, match="ring: is str; must be a fitted object"):
+        mi_ring.export(str(finished), "a.ply")
+    with pytest.raises(mi_ring.InputError, match="--subdivisions: is 1.5, must be 0 to 10"):
+        mi_ring.export(ring, "a.ply", subdivisions=1.5)

@@ -189,6 +189,12 @@ BROKEN = {
                                   ["small.xml", '"000"', "cy is 1e+06", "pixels?"]),
     "a radius that is infinite in float32": (xml(SHAPE, SHAPE + SPHERE.format(1e39)), [], ["small.xml", "radius is"]),
     "radius 0": (xml(SHAPE, SHAPE + SPHERE.format(0)), [], ["small.xml", "radius is 0"]),
+    "another radius than the object's": (xml(SHAPE, SHAPE + SPHERE.format(1e-3)), [],
+                                         ["small.xml: center and radius of the shapenet shape: are 400, -150, 90 and "
+                                          "0.001, but", "correct them or leave them out"]),
+    "another place than the object's": (xml(SHAPE, SHAPE + SPHERE.format(30).split("<float")[0].replace("400", "4e5")),
+                                        [], ["small.xml: center and radius of the shapenet shape: are 4e+05, -150, 90",
+                                             "has a radius of 2", "leave them out"]),
     "NaN as radius": (xml(SHAPE, SHAPE + SPHERE.format("nan")), [], ["small.xml", "radius is nan"]),
     "NaN as centre": (xml(SHAPE, SHAPE + SPHERE.format(30).replace("-150", "nan")), [], ["small.xml", "center is"]),
     "missing domain": (xml(SHAPE, SHAPE + '<string name="domain" value="none.ply"/>'), [],

@@ -6,9 +6,10 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from mi_ring import fit
+from mi_ring import export, fit
 from mi_ring.errors import InputError
 from mi_ring.fit_config import FitConfig, Task, parse_options
 from mi_ring.fitting.config import PRESETS, TASK, WEIGHTS, Ablation, Common, Config, Tuning
@@ -39,6 +40,13 @@ def test_help_shows_what_users_set_and_says_how_many_more_options_there_are(caps
     assert everything["weights options"] == {f"weights.{name.replace('_', '-')}" for name in WEIGHTS}
     hidden = sum(map(len, everything.values())) - len(found["options"])
     assert below == f"{hidden} more options, for tuning and ablation: --help-all shows them" != other
+
+
+@pytest.mark.parametrize("arguments", [["--help-all"], ["run", "--help-all"], ["--help"]])
+def test_all_commands_have_both_helps(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        export.main(arguments)
+    assert not stop.value.code and "--subdivisions" in capsys.readouterr().out
 
 
 def test_hidden_options_are_options_all_the_same():
@@ -102,8 +110,10 @@ def test_settings_that_cannot_be_are_one_line(content, words, tmp_path):
         (["--weights.mask", "-5"], ["--weights", "0 or more"]),
         (["--seed", str(2**70)], ["--seed", "below 2^63"]),
         (["--iterations", "many"], ["--iterations: is many; must be a whole number"]),
-        (["--iterations", "0"], ["--iterations", "0", "at least 1"]),
-        (["--steps", "0"], ["--steps: is 0, must be at least 1"]),
+        (["--iterations", "0"], ["--iterations", "0", "1 to 1,000,000"]),
+        (["--steps", "0"], ["--steps: is 0, must be 1 to 10,000"]),
+        (["--iterations", "9" * 20], ["--iterations: is 99999999999999999999, must be 1 to 1,000,000"]),
+        (["--levels", "4", "5", "--widths", "9", "9", "--shares", "1e308", "1e308"], ["--shares: is 1e+308 1e+308"]),
         (["--velocity-decay", "0"], ["--velocity-decay", "0", "above 0"]),
         (["--iteration", "5"], ["Unrecognized options: --iteration", "--iterations"]),
         (["--levels", "4", "9"], ["--levels", "0 to 8"]),
@@ -125,3 +135,31 @@ def test_an_unusable_option_is_one_line_that_names_it(options, words):
         fit.parse_options(["scene.xml", *options])
     complaint = str(error.value)
     assert complaint.startswith(words[0]) and "\n" not in complaint and all(word in complaint for word in words)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"iterations": "many"}, "--iterations: is many, must be as mi-ring fit --help-all says"),
+        ({"iterations": 3.5}, "--iterations: is 3.5"),
+        ({"iterations": True}, "--iterations: is True"),
+        ({"levels": 3}, "--levels: is 3"),
+        ({"weights": {"rgb": None}}, "--weights: is rgb None"),
+        ({"parameters": {"roughness": 1}}, "--parameters: is roughness 1"),
+        ({"seed": None}, "--seed: is None"),
+        ({"shadows": "no"}, "--shadows: is no"),
+        ({"domain": ("mesh", 3)}, "--domain: is mesh 3"),
+        ({"learning_rate": 10**400}, "--learning-rate: is 1000"),
+        ({"loss": ["l1"]}, "--loss: is l1, must be one of l2"),
+    ],
+)
+def test_settings_of_another_type_are_refused(settings, words):
+    with pytest.raises(InputError, match=words):
+        Config(**settings)
+
+
+def test_numbers_of_numpy_are_settings_that_can_be_written():
+    config = Config(iterations=np.int64(5), learning_rate=np.float32(0.5), levels=np.array([2]).tolist(), widths=[28],
+                    shares=(np.float64(1),), shadows=np.bool_(False))  # fmt: skip
+    same = {"iterations": 5, "learning_rate": 0.5, "levels": [2], "widths": [28], "shares": [1], "shadows": False}
+    assert config.settings() == Config().settings() | same

@@ -1,6 +1,7 @@
 """Large photographs: reduced once, cropped to the object, and kept in the cache folder."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,6 +16,7 @@ import mi_ring
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture import arrays, reduction
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.decoding import LinearImage
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.pixels import Pixels
 from mi_ring.geometry.camera import Camera
@@ -162,6 +164,18 @@ def test_the_second_time_no_photograph_is_decoded(tmp_path, monkeypatch, own_cac
     third = load_capture(path, width=200)
     assert (third.observe([0]).rgb == first.observe([0]).rgb).all()
     assert not (third.observe([1]).rgb == first.observe([1]).rgb).all()
+
+
+@pytest.mark.parametrize("byte", [6, 8, 10, 16, 20, 42])
+def test_damage_anywhere_in_a_cached_file_is_noticed(byte, own_cache):
+    """A version, encryption, a method, a checksum, a size and a place that no zip file of ours has."""
+    key, mask = reduction.key_of("damaged"), np.arange(6, dtype=np.uint8).reshape(2, 3)
+    image = LinearImage(np.ones((2, 3, 3), np.float16), np.zeros((2, 3, 3), bool))
+    content = bytearray(reduction.packed({"images": image, "masks": mask}))
+    for entry in re.finditer(b"PK\x01\x02", content):
+        content[entry.start() + byte] ^= 0xA1
+    cache.store(key, bytes(content))
+    assert reduction.unpacked(key, "masks", lambda: "made") == "made" and not cache.cached(key)
 
 
 def test_what_is_in_the_cache_is_of_these_masks_alone(tmp_path):

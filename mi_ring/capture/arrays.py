@@ -12,17 +12,17 @@ from numpy.typing import ArrayLike
 from mi_ring.capture.decoding import is_linear
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import photograph_element, room_elements, scene_bytes, scene_element
-from mi_ring.errors import InputError
-from mi_ring.geometry.camera import Camera
+from mi_ring.errors import LARGEST, InputError, require_numbers
+from mi_ring.geometry.camera import Camera, usable_camera
 from mi_ring.images import write_image
-from mi_ring.plugins.properties import LARGEST
 from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER
-from mi_ring.scene.lights import Light
+from mi_ring.scene.lights import Light, usable_light
 from mi_ring.scene.shot import Encoding, Files, Shot
 from mi_ring.system.files import writing
 
 FLATTEST = 8  #: largest ratio of a photograph's sides
-NAME = re.compile(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]*")  #: of a photograph, which is also the name of its files
+#: Of a photograph, which is also the name of its files. XML lacks some characters, and $ begins Mitsuba's variables.
+NAME = re.compile(r"(?!\.)[^/\\$\x00-\x1f\ud800-\udfff\ufffe\uffff]+")
 
 Item = TypeVar("Item")
 
@@ -34,7 +34,7 @@ def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarra
     """
     if encoding not in ("auto", "srgb", "linear"):
         raise InputError(f"encoding: is {encoding!r}, must be one of auto, srgb, linear")
-    found = [image_of(image, encoding, f"images[{k}]") for k, image in enumerate(images)]
+    found = [image_of(image, encoding, f"images[{k}]") for k, image in enumerate(listed(images, "images"))]
     if not found:
         raise InputError("images: is empty; give one array for each photograph")
     return found
@@ -58,15 +58,31 @@ def shots_of(
     Raises InputError if an argument is invalid.
     """
     count = len(images)
-    full = float(numbers(saturation, (), "saturation"))
+    full = float(require_numbers(saturation, (), "saturation"))
     if not full > 0:
         raise InputError(f"saturation: is {saturation}, must be above 0")
     columns = names_of(names, count), images, one_each(cameras, count, "cameras"), one_each(lights, count, "lights")
     return tuple(
-        Shot(name, camera_of(camera, image, f"cameras[{k}]"), light_of(light, f"lights[{k}]"), encoding=encoding,
+        Shot(name, camera_of(camera, image, f"cameras[{k}]"), usable_light(light, f"lights[{k}]"), encoding=encoding,
              saturation=full, calibrated=calibrated)
         for k, (name, image, camera, light) in enumerate(zip(*columns))
     )  # fmt: skip
+
+
+def listed(items: Iterable[Item], what: str) -> list[Item]:
+    """Return the items as a list. Raises InputError, which begins with `what`, if they are none."""
+    try:
+        return list(items)
+    except TypeError:
+        raise InputError(f"{what}: is {type(items).__name__}; must be a list, one item for each photograph") from None
+
+
+def array_of(value: ArrayLike, what: str) -> np.ndarray:
+    """Return an array of any type and shape. Raises InputError, which begins with `what`, if rows differ in length."""
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{what}: is no array ({str(error).partition('.')[0]})") from error
 
 
 def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item | None]:
@@ -74,7 +90,7 @@ def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item |
 
     Raises InputError if there are not `count` items. The message begins with `what`.
     """
-    found: list[Item | None] = [None] * count if items is None else list(items)
+    found: list[Item | None] = [None] * count if items is None else listed(items, what)
     if len(found) != count:
         raise InputError(f"{what}: has {len(found)} for {count} images; give one for each")
     return found
@@ -85,7 +101,7 @@ def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
 
     Raises InputError if it is invalid. The message begins with `what`.
     """
-    array = np.asarray(image)
+    array = array_of(image, what)
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 3 or array.shape[2] != 3 or not array.size:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be (H, W, 3) of uint8, uint16 or "
                          "float32")  # fmt: skip
@@ -105,7 +121,7 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
     """
     if mask is None:
         return None
-    array = np.asarray(mask)
+    array = array_of(mask, what)
     if array.dtype not in (np.uint8, bool) or array.shape != image.shape[:2]:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be {image.shape[:2]} of bool, or of "
                          "uint8 from 0 to 255")  # fmt: skip
@@ -114,60 +130,15 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
     return array if array.dtype == np.uint8 else np.where(array, 255, 0).astype(np.uint8)
 
 
-def camera_of(camera: object, image: np.ndarray, what: str) -> Camera:
+def camera_of(camera: Camera | None, image: np.ndarray, what: str) -> Camera:
     """Check the camera of an image. Returns the camera with its numbers rounded to float32.
 
     Raises InputError if the camera is invalid, or if its size is not that of the image. The message begins with `what`.
     """
-    if not isinstance(camera, Camera):
-        raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
-    to_world, focal, centre, distortion = (
-        numbers(getattr(camera, name), shape, f"{what}: {name}")
-        for name, shape in (("to_world", (4, 4)), ("focal", (2,)), ("centre", (2,)), ("distortion", ()))
-    )
-    size = image.shape[1], image.shape[0]
-    own = camera._replace(to_world=to_world, focal=focal, centre=centre, size=size, distortion=float(distortion))
-    if tuple(camera.size) != own.size:
-        raise InputError(f"{what}: size is {tuple(camera.size)}, (width, height); its image is {sides(image)}")
-    if not (own.focal > 0).all():
-        raise InputError(f"{what}: focal is {own.focal}; must be above 0 [px]")
-    if not np.allclose(own.to_world[3], [0, 0, 0, 1]):
-        raise InputError(f"{what}: to_world: its last row is {own.to_world[3]}, must be 0 0 0 1; is it transposed?")
-    if fault := own.fault():
-        raise InputError(f"{what}: {fault}")
+    own, size = usable_camera(camera, what), (image.shape[1], image.shape[0])
+    if own.size != size:
+        raise InputError(f"{what}: size is {own.size}, (width, height); its image is {sides(image)}")
     return own
-
-
-def light_of(light: object, what: str) -> Light | None:
-    """Check a light. Returns the light with its numbers rounded to float32. If `light` is None, returns None.
-
-    Raises InputError if the light is invalid. The message begins with `what`.
-    """
-    if light is None:
-        return None
-    if not isinstance(light, Light) or light.kind not in ("point", "directional"):
-        kind = f'of kind "{light.kind}"' if isinstance(light, Light) else type(light).__name__
-        raise InputError(f"{what}: is {kind}; must be a mi_ring.Light, point or directional, or None")
-    vector, rgb = (numbers(getattr(light, name), (3,), f"{what}: {name}").astype(float) for name in ("vector", "rgb"))
-    if light.kind == "directional" and not vector.any():
-        raise InputError(f"{what}: vector is 0; must be the direction in which the light travels")
-    return Light(light.kind, vector, rgb)
-
-
-def numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert a value to a float32 array of this `shape`.
-
-    Raises InputError if this is impossible, or if a number is not finite or too large. The message begins with `what`.
-    """
-    try:
-        array = np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise InputError(f"{what}: is {type(value).__name__}; must be numbers of shape {shape}") from None
-    if array.shape != shape:
-        raise InputError(f"{what}: is of shape {array.shape}; must be {shape}")
-    if not (np.abs(array) <= LARGEST).all():
-        raise InputError(f"{what}: must be finite, {LARGEST:g} at most")
-    return array.astype(np.float32)
 
 
 def names_of(names: Sequence[str] | None, count: int) -> list[str]:
@@ -179,7 +150,7 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
         return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
     for k, name in enumerate(one_each(names, count, "names")):
         if not isinstance(name, str) or not NAME.fullmatch(name) or name == "object":
-            raise InputError(f'names[{k}]: is {name!r}; must be a file name without suffix, not "object"')
+            raise InputError(f'names[{k}]: is {name!r}; must be a file name without suffix and $, not "object"')
         if name in names[:k]:
             raise InputError(f"names[{k}]: {name!r} occurs twice")
     return list(names)
@@ -190,10 +161,10 @@ def room_of(room: ArrayLike) -> np.ndarray:
 
     Raises InputError if n is not (order + 1)² for an order up to `MAX_ORDER`.
     """
-    array, counts = np.asarray(room, float), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
+    array, counts = array_of(room, "room"), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
     if array.ndim != 2 or array.shape[0] not in counts:
         raise InputError(f"room: is of shape {array.shape}; must be (n, 3), n one of {', '.join(map(str, counts))}")
-    found = numbers(array, (len(array), 3), "room").astype(float)
+    found = require_numbers(array, (len(array), 3), "room").astype(float)
     return np.concatenate([found, np.zeros((BASIS - len(found), 3))])
 
 
@@ -222,8 +193,8 @@ def scene_xml(
 
     The other arguments are those of `Capture.from_arrays`. Raises InputError if one is invalid.
     """
-    middle = None if center is None else numbers(center, (3,), "center")
-    reach = None if radius is None else float(numbers(radius, (), "radius"))
+    middle = None if center is None else require_numbers(center, (3,), "center")
+    reach = None if radius is None else float(require_numbers(radius, (), "radius"))
     if reach is not None and not reach > 0:
         raise InputError(f"radius: is {radius}, must be above 0")
     elements = [photograph_element(replace(shot, files=own)) for shot, own in zip(shots, files)]

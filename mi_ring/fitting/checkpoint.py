@@ -1,13 +1,13 @@
 """Writes and reads checkpoints, from which `--resume` continues, and tests whether input files have changed since."""
 
 import contextlib
-import math
 from pathlib import Path
 
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import WEIGHTS, Config, as_typed
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.start import StateError
 from mi_ring.objects.ring_file import read_state
 from mi_ring.system.files import digest, is_sealed, relative_to, write_state
 from mi_ring.version import __version__
@@ -86,16 +86,9 @@ def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
     """
     require_same_files(state, capture, config, folder)
     try:
-        fit = Fit(capture, config, state=state["fit"])
-        if not (0 <= fit.iteration <= fit.iterations and 0 <= fit.course.seconds < math.inf):
-            raise ValueError(f"iteration {fit.iteration} after {fit.course.seconds} s")
-        for entry in fit.course.log:
-            _ = entry["iteration"], entry["seconds"]
-    except InputError:
-        raise
-    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{folder / NAME}: holds no fit that could go on ({error!r}); {ADVICE}") from error
-    return fit
+        return Fit(capture, config, state=state["fit"])
+    except StateError as error:
+        raise InputError(f"{folder / NAME}: holds no fit that could go on ({error}); {ADVICE}") from error
 
 
 def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:

@@ -10,6 +10,7 @@ import math
 import reprlib
 from dataclasses import dataclass, field
 from itertools import repeat
+from numbers import Integral, Real
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
@@ -22,6 +23,9 @@ WEIGHTS = {
     "rgb": 1.0, "mask": 5.0, "velocity": 0.01, "calibration": 1e-3, "settling": 0.03,
     "normal_variation": 0.0, "material_rank": 0.0,
 }  # fmt: skip
+
+#: Largest values of settings. Far below them, memory or patience ends.
+MOST = {"iterations": 10**6, "steps": 10**4, "batch": 10**6, "spp": 10**4}
 
 #: What `Config.refine` may have.
 Unknown = Literal[
@@ -198,16 +202,19 @@ class Config(Ablation, Tuning, Common):
         both = {"power", "gain"} <= set(self.refine)
         require(not both, "refine", "without power or without gain, for they look alike")
 
-        for f in dataclasses.fields(Config):  # for calls from Python: the command line has checked them
-            if get_origin(f.type) is Literal:
-                allowed = get_args(f.type)
-                require(getattr(self, f.name) in allowed, f.name, f"one of {', '.join(allowed)}")
         if isinstance(self.domain, tuple | list) and len(self.domain) == 2 and self.domain[0] == "mesh":
-            object.__setattr__(self, "domain", ("mesh", Path(self.domain[1])))
+            object.__setattr__(self, "domain", ("mesh", self.domain[1]))
         else:
             require(self.domain in ("auto", "sphere", "hull"), "domain", "auto, sphere, hull or (mesh, FILE)")
-        for name in ("iterations", "steps", "batch", "spp"):
-            require(getattr(self, name) >= 1, name, "at least 1")
+        for f in dataclasses.fields(Config):  # for calls from Python: the command line has checked them
+            allowed = get_args(f.type) if get_origin(f.type) is Literal else ()
+            what = f"one of {', '.join(allowed)}" if allowed else "as mi-ring fit --help-all says"
+            try:
+                object.__setattr__(self, f.name, of_type(f.type, getattr(self, f.name)))
+            except (ValueError, OverflowError):  # OverflowError: an integer beyond the range of floats
+                require(False, f.name, what)
+        for name, most in MOST.items():
+            require(1 <= getattr(self, name) <= most, name, f"1 to {most:,}")
         require(1 <= self.frequencies <= 64, "frequencies", "1 to 64")
         require(self.encoding != "octaves" or self.frequencies <= 16, "frequencies", "1 to 16 for octaves")
         require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
@@ -220,7 +227,7 @@ class Config(Ablation, Tuning, Common):
         for name in ("widths", "shares"):
             value = getattr(self, name)
             require(len(value) == len(self.levels), name, f"as many values as --levels ({len(self.levels)})")
-            require(all(0 < v < math.inf for v in value), name, "above 0")
+            require(all(v > 0 for v in value) and sum(value) < math.inf, name, "above 0")
         object.__setattr__(self, "weights", WEIGHTS | self.weights)
         for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
@@ -281,21 +288,26 @@ class Config(Ablation, Tuning, Common):
 
 
 def of_type(kind: Any, value: Any) -> Any:
-    """Convert a `value` from a JSON file to the type `kind` of a setting. Raises ValueError if this is impossible."""
+    """Convert a `value`, from JSON or from a caller, to the type `kind` of a setting.
+
+    Raises ValueError if this is impossible.
+    """
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         for one in inner:
             with contextlib.suppress(ValueError):
                 return of_type(one, value)
-    elif origin is tuple and isinstance(value, list):
+    elif origin is tuple and isinstance(value, list | tuple):
         kinds = repeat(inner[0], len(value)) if inner[-1] is ... else inner
         return tuple(of_type(one, item) for one, item in zip(kinds, value, strict=True))
     elif origin is dict and isinstance(value, dict):
         return {name: of_type(inner[1], item) for name, item in value.items()}
-    elif kind is Path and isinstance(value, str):
+    elif kind is Path and isinstance(value, str | Path):
         return Path(value)
-    elif kind is float and type(value) in (int, float):
-        return float(value)
+    elif kind in (int, float) and isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool):
+        return kind(value)  # also of a number of numpy, which JSON cannot hold
+    elif kind is bool and not isinstance(value, str) and value in (True, False):
+        return bool(value)
     elif type(value) is kind or (origin is Literal and value in inner):
         return value
     raise ValueError(value)

@@ -1,5 +1,6 @@
 """The course of a fit: its progress, its log and its measurements so far."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +20,16 @@ class Course:
     log: list[dict[str, Any]] = field(default_factory=list)  #: entries of every fifth iteration and of the last
     masks: Masks = field(default_factory=dict)  #: masks that were found anew
     validation: dict[str, Any] = field(default_factory=dict)  #: on held-out photographs, when the fit is done
+
+    @classmethod
+    def of(cls, fields: dict[str, Any], iterations: int) -> "Course":
+        """Make the course of a fit of so many iterations that is to go on. Wrong fields raise errors of Python."""
+        course = cls(**fields)
+        if not (0 <= course.iteration <= iterations and 0 <= course.seconds < math.inf):
+            raise ValueError(f"iteration {course.iteration} after {course.seconds} s")
+        for entry in course.log:
+            _ = entry["iteration"], entry["seconds"]
+        return course
 
     def record(self, it: Iteration, learning_rate: float, regulariser: RegulariserStrength, last: bool) -> None:
         """Append an entry about the iteration `it` to the log, if its number is a multiple of 5 or it is the `last`.

@@ -28,13 +28,13 @@ from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.result import result_of
 from mi_ring.fitting.sampler import Batch, Sampler
 from mi_ring.fitting.schedule import Schedule
-from mi_ring.fitting.start import require_settings, starting_ring
+from mi_ring.fitting.start import require_settings, restored, restoring, starting_ring
 from mi_ring.fitting.terms import Loss, TermLike
 from mi_ring.fitting.validation import validate
 from mi_ring.nets.brdf_net import MaterialNet
 from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.ring_file import ring_of, ring_state
+from mi_ring.objects.ring_file import ring_state
 from mi_ring.output import results
 from mi_ring.output.fit_result import FitResult
 from mi_ring.system.machine import release_memory
@@ -65,22 +65,21 @@ class Fit(Renamed):
         state: dict[str, Any] | None = None, lighting: Lighting | None = None,
     ) -> None:  # fmt: skip
         config = config or Config()
-        self.loss, self.callbacks = Loss(terms, config.weights), list(callbacks)
         require_settings(capture, config)
+        self.loss, self.callbacks = Loss(terms, config.weights), list(callbacks)
         if state and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
-        lighting = Lighting(*state["lighting"]) if state else lighting or Lighting.of(capture, config)
+        lighting, ring = restored(state) if state else (lighting, None)
         if config.deterministic:
             recompute_normals(capture.scene)
-        self.problem = Problem.of(capture, config, lighting)
+        self.problem = Problem.of(capture, config, lighting or Lighting.of(capture, config))
         torch.manual_seed(config.seed)
-        ring = ring_of(state["ring"]) if state else starting_ring(self.problem, networks)
-        self.loss.require_velocity(ring.shape_net)
-        self.model = Model(self.problem, ring.to(self.problem.device))
-        settling = lighting.kind in AMBIGUOUS and self.loss.weight("settling") > 0
+        self.model = Model(self.problem, (ring or starting_ring(self.problem, networks)).to(self.problem.device))
+        self.loss.require_velocity(self.ring.shape_net)
+        settling = self.problem.lighting.kind in AMBIGUOUS and self.loss.weight("settling") > 0
         self.plan: Callable[[Config], Schedule] = lambda config: Schedule.of(config, self.model.starts_near, settling)
         self.schedule = self.plan(config)
-        self.sampler, self.renderer = Sampler(self.problem), Renderer(self.problem, ring)
+        self.sampler, self.renderer = Sampler(self.problem), Renderer(self.problem, self.ring)
         self.optimisation = Optimisation(self.problem, self.model, self.loss.terms)
         self.regulariser, self.course = RegulariserStrength(), Course()
         self.capture = self.problem.capture  #: with the masks that are used now
@@ -190,10 +189,11 @@ class Fit(Renamed):
         })  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state`, the result of `state()` of a fit with the same networks and lighting."""
-        if self.model.calibration:
-            self.model.calibration.load_state_dict(state["calibration"])
-        for name in PARTS:
-            getattr(self, name).restore(state[name])
-        self.course = Course(**state["course"])
-        self.capture = with_masks(self.problem.capture, self.course.masks)
+        """Continue from `state()` of a fit with the same settings, networks and lighting. Else raises InputError."""
+        with restoring():
+            if self.model.calibration:
+                self.model.calibration.load_state_dict(state["calibration"])
+            for name in PARTS:
+                getattr(self, name).restore(state[name])
+            self.course = Course.of(state["course"], self.iterations)
+            self.capture = with_masks(self.problem.capture, self.course.masks)

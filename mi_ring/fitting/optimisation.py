@@ -1,5 +1,6 @@
 """The optimisation: Muon for hidden weights, Adam for all other parameters, and one step of all optimisers."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -98,6 +99,9 @@ class Optimisation:
             solver.look(it)
         if not it.terms:
             return it
+        if not loss.requires_grad and not it.stage.settles:  # which outlines alone do not change
+            raise InputError(f"terms: {', '.join(it.terms)}: have no gradients, so the fit would change nothing; "
+                             "compute them from it.prediction, by operations of PyTorch")  # fmt: skip
         self.backward(loss, it)
         clip = torch.nn.utils.clip_grad_norm_
         ring, calibration = self.model.ring, self.model.calibration
@@ -115,7 +119,9 @@ class Optimisation:
         if not self.guard.note(healthy):
             option = "--muon-rate" if self.problem.config.optimizer == "muon" else "--learning-rate"
             path = self.problem.capture.path
-            raise InputError(f"{path}: diverged at iteration {it.number - 1}; try a lower {option}")
+            wrong = ", ".join(name for name, value in it.terms.items() if not math.isfinite(value))
+            raise InputError(f"{path}: diverged at iteration {it.number - 1}{' by the term ' * bool(wrong)}{wrong}; "
+                             f"try a lower {option}")  # fmt: skip
         self.model.update_albedo()
         return it
 

@@ -1,16 +1,21 @@
 """The start of a fit: its networks, its start surface and the normalising sphere; and checks of the input."""
 
+import contextlib
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.lighting import Lighting
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import Refinement
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
@@ -19,12 +24,18 @@ from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
 from mi_ring.nets.resnet import shape_net_of
 from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_of
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.system.optional import installed
 
+DISPROPORTIONATE = 20.0  #: ratio of the sizes of the normalising sphere and the start surface that is no choice
+
 
 def require_settings(capture: Capture, config: Config) -> None:
-    """Raise InputError if a setting contradicts the capture."""
+    """Raise InputError if a setting contradicts the capture, or if one of them is something else."""
+    for name, value, kind in (("capture", capture, Capture), ("config", config, Config)):
+        if not isinstance(value, kind):
+            raise InputError(f"{name}: is {type(value).__name__}, must be a mi_ring.{kind.__name__}")
     if not capture.images:
         raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
     if {"curve", "contrast"} & set(config.refine) and any(shot.files.ambient for shot in capture.shots):
@@ -38,6 +49,28 @@ def require_settings(capture: Capture, config: Config) -> None:
                          "the photographs' own lights; leave it out, or find them all by --light lamps")  # fmt: skip
 
 
+class StateError(InputError):
+    """The state of another fit, or of none."""
+
+
+@contextlib.contextmanager
+def restoring() -> Iterator[None]:
+    """Context manager that turns the errors of a wrong state of a fit into StateError."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise StateError("state: is of a fit with other settings, networks or photographs, or of none "
+                         f"({error!r})") from error  # fmt: skip
+
+
+def restored(state: dict[str, Any]) -> tuple[Lighting, FittedObject]:
+    """Read lighting and object from the state of a fit. Raises InputError if it is none."""
+    with restoring():
+        return Lighting(*state["lighting"]), ring_of(state["ring"])
+
+
 def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -> FittedObject:
     """Make the object as it is before the first iteration. `networks`: (Shape-Net, BRDF-Net); None: the paper's.
 
@@ -45,6 +78,7 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
     """
     capture, config = problem.seen, problem.config
     domain, center, radius = starting_surface(capture, config.domain)
+    require_normalised(capture, domain, center, radius)
     require_view_from_outside(capture, domain, center, radius)
     parameters, bsdf = predicted_parameters(capture, config.parameters)
     if problem.lighting.kind != "capture":
@@ -65,6 +99,8 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
     scale = reflectance / power
     indirect = config.indirect and math.pi * scale < 1
     if networks:
+        if not (isinstance(networks, Sequence) and [isinstance(n, nn.Module) for n in networks] == [True, True]):
+            raise InputError("networks: must be two instances of torch.nn.Module, (Shape-Net, BRDF-Net)")
         for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
             if not hasattr(network, needed):
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
@@ -113,6 +149,18 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
     if surface is not None and (choice == "hull" or installed("gpytoolbox") or genus(surface)):
         return closed_domain(surface, shape.center, shape.radius)
     return Sphere(), *capture.sphere()
+
+
+def require_normalised(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
+    """Raise InputError if the scene's normalising sphere has quite another size than the start surface, or place."""
+    size = float(np.ptp(domain.points, axis=0).max()) / 2
+    if not 1 / DISPROPORTIONATE < size < DISPROPORTIONATE:
+        raise InputError(
+            f"{capture.path}: center and radius of the shapenet shape: are {', '.join(f'{c:.4g}' for c in center)} and "
+            f"{radius:.4g}, but the surface that the fit starts from has a radius of {size * radius:.4g} about "
+            f"{', '.join(f'{c:.4g}' for c in center + radius * (domain.points.min(0) + domain.points.max(0)) / 2)}; "
+            "correct them or leave them out"
+        )
 
 
 def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:

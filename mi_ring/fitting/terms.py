@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from numbers import Real
 from typing import NamedTuple, TypeAlias
 
 import torch
@@ -110,12 +111,19 @@ class Loss:
     def __init__(self, terms: Mapping[str, TermLike] | None, weights: Mapping[str, float]) -> None:
         """Make a loss. `terms`: by name; None: `default_terms`. `weights`: by name of the term.
 
-        Raises InputError for a reserved name, for a weight whose term does not exist, and if no term with a weight
-        above 0 compares the surface with photographs.
+        Raises InputError for something that is no term, for a reserved name, for a weight whose term does not exist,
+        and if no term with a weight above 0 compares the surface with photographs.
         """
         given = default_terms if terms is None else terms
+        if not isinstance(given, Mapping):
+            raise InputError(f"terms: is {type(given).__name__}, must be a dict of terms by their names")
         self.terms = {name: term if isinstance(term, Term) else Term(term) for name, term in given.items()}
         self.weights = weights
+        for name, (function, own, schedule) in self.terms.items():
+            usable = isinstance(name, str) and isinstance(own, Real) and math.isfinite(own)
+            if not (usable and callable(function) and (schedule is None or callable(schedule))):
+                raise InputError(f"terms: {name}: must be a function, or a Term of a function, a finite weight and a "
+                                 "function that gives its factor")  # fmt: skip
         if reserved := self.terms.keys() & RESERVED:
             raise InputError(f"terms: {min(reserved)}: the log has an entry of that name; give the term another")
         if not any(self.weight(name) for name in self.terms.keys() - WITHOUT_PHOTOGRAPHS):

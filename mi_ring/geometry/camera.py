@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mi_ring.errors import InputError
+from mi_ring.errors import InputError, require_numbers
 
 #: Limits of `distortion` · r², where r is the distance of a corner of the picture from its centre [focal lengths].
 #: Below −4/27 the lens folds: it shows some points twice. Above 10, Newton's method leaves an error of over 1e-6.
@@ -150,6 +150,27 @@ class Camera(NamedTuple):
         if not rigid or np.linalg.det(rotation) < 0:
             return "to_world must be a rotation and a translation, without scale or mirror"
         return None
+
+
+def usable_camera(camera: Camera | None, what: str) -> Camera:
+    """Check a camera and round its numbers to float32. Raises InputError; `what` begins the message."""
+    if not isinstance(camera, Camera):
+        raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
+    to_world, focal, centre, distortion, sides = (
+        require_numbers(getattr(camera, name), shape, f"{what}: {name}")
+        for name, shape in (("to_world", (4, 4)), ("focal", (2,)), ("centre", (2,)), ("distortion", ()), ("size", (2,)))
+    )
+    size = int(sides[0]), int(sides[1])
+    own = Camera(to_world, focal, centre, size, float(distortion))
+    if size != tuple(camera.size) or min(size) < 1:
+        raise InputError(f"{what}: size is {tuple(camera.size)}; must be whole numbers above 0, (width, height)")
+    if not (own.focal > 0).all():
+        raise InputError(f"{what}: focal is {own.focal}; must be above 0 [px]")
+    if not np.allclose(own.to_world[3], [0, 0, 0, 1]):
+        raise InputError(f"{what}: to_world: its last row is {own.to_world[3]}, must be 0 0 0 1; is it transposed?")
+    if fault := own.fault():
+        raise InputError(f"{what}: {fault}")
+    return own
 
 
 def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics.embedding import inside_out
 from mi_ring.metrics.image_errors import SPP, compare_photographs
@@ -44,6 +45,10 @@ def evaluate(
     `_novel` about `novel`. `views` and `novel_views` are lists with the numbers of each photograph. A number that is
     not defined, such as the genus of an open mesh, is missing.
     """
+    if spp < 1:
+        raise InputError(f"spp: is {spp}, must be at least 1")
+    if align not in (None, "rigid", "similarity"):
+        raise InputError(f"align: is {align!r}, must be rigid, similarity or None")
     run, mesh = Path(run), Path(mesh)
     ring, capture = load_fit(run), load_capture(run / "scene.xml", width=COMPARED, crop=False)
     unseen = novel and load_capture(novel, width=COMPARED, crop=False)

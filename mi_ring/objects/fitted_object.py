@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mi_ring.geometry.camera import Camera
+from mi_ring.errors import InputError, SceneError
+from mi_ring.geometry.camera import Camera, usable_camera
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.nets.brdf_net import COOK_TORRANCE, BRDFNet, MaterialNet, Parameter
 from mi_ring.nets.shape_net import Flow, ShapeNet
@@ -15,8 +16,10 @@ from mi_ring.rendering import prediction
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.assembly import assembled
-from mi_ring.scene.lights import Light
+from mi_ring.scene.lights import Light, usable_light
 from mi_ring.scene.shot import Shot
+
+FINEST, MOST_SPP = 10, 10**4  #: level of the mesh, and samples per pixel, of a picture
 
 
 class FittedObject(nn.Module):
@@ -80,14 +83,24 @@ class FittedObject(nn.Module):
         `light`: default: a point light of intensity 1 at the camera. `spp`: samples per pixel. `level`: level of the
         mesh; default: `subdivisions`. `shadows`: the object casts shadows on itself. The picture allows one backward
         pass to the parameters of both networks. Its gradients include moving outlines and shadows.
+
+        Raises InputError for something that is no camera or no light, and for numbers out of range.
         """
+        level = self.subdivisions if level is None else level
+        for name, value, least, most in (("spp", spp, 1, MOST_SPP), ("level", level, 0, FINEST)):
+            if not (isinstance(value, int) and least <= value <= most):
+                raise InputError(f"{name}: is {value}, must be a whole number from {least} to {most:,}")
+        shot = Shot("view", usable_camera(camera, "camera"), usable_light(light, "light"))
+        try:
+            view = Photographs.of([shot])
+        except SceneError as error:
+            raise InputError(f"light: {error}") from error
         shape = mi.load_dict({"type": "shapenet", "subdivisions": 0, "flash": False, "bsdf": {"type": "cooktorrance"}})
         surface = Surface(assembled([shape]), shape, self)
-        s, faces = self.domain.sample(self.subdivisions if level is None else level)
+        s, faces = self.domain.sample(level)
         surface.set_faces(faces)
         vertices, material = self(s.to(self.center.device))
-        shot = Photographs.of([Shot("view", camera, light)])
-        return prediction.render(surface, shot, vertices, material, spp, seed, shadows)[0][0]
+        return prediction.render(surface, view, vertices, material, spp, seed, shadows)[0][0]
 
     def to_scene(self, points: Tensor) -> Tensor:
         """Convert points (V, 3) from the normalised frame to scene units. Points below the table are moved up to it."""

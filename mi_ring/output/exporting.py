@@ -38,6 +38,8 @@ def export(
 
     Raises InputError for values out of range, for a BSDF that glTF cannot express, and if a file cannot be written.
     """
+    if not isinstance(ring, FittedObject):
+        raise InputError(f"ring: is {type(ring).__name__}; must be a fitted object, which mi_ring.load_fit returns")
     file = Path(file)
     kind = require_exportable(file, subdivisions, resolution, time, metres)
     if kind == ".xml" and photograph is None:
@@ -73,7 +75,7 @@ def require_exportable(
     if kind not in KINDS:
         raise InputError(f"{file}: must end in {', '.join(KINDS)}")
     finest = MAX_PLY_LEVEL if kind == ".ply" else MAX_LEVEL
-    if subdivisions is not None and not 0 <= subdivisions <= finest:
+    if subdivisions is not None and not (isinstance(subdivisions, int) and 0 <= subdivisions <= finest):
         more = f"; textures have the finer detail; .ply takes up to {MAX_PLY_LEVEL}" * (finest == MAX_LEVEL)
         raise InputError(f"--subdivisions: is {subdivisions}, must be 0 to {finest}{more}")
     if not 64 <= resolution <= 4096:

@@ -6,6 +6,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.errors import LARGEST
+
 
 def beside_scene(name: str) -> Path:
     """Return the path of the file `name` in a scene: relative to the folder of the scene file.
@@ -13,9 +15,6 @@ def beside_scene(name: str) -> Path:
     A scene without a file uses the working folder. The file need not exist.
     """
     return Path(str(mi.file_resolver()[0])) / name
-
-
-LARGEST = 1e18  #: number whose square is finite in float32
 
 
 def number(props, name: str, default: float | None = None, positive: bool = False) -> float:

@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.errors import InputError, require_numbers
+
 LAMP_CLASSES = "PointLight", "DirectionalEmitter"  #: Mitsuba's classes of emitters that can be a `Light`
 
 
@@ -15,6 +17,21 @@ class Light(NamedTuple):
     kind: Literal["point", "directional"]
     vector: np.ndarray  #: (3,) position [scene units], or direction in which the light travels
     rgb: np.ndarray  #: (3,) intensity [W/sr], or irradiance [W/m²]
+
+
+def usable_light(light: Light | None, what: str) -> Light | None:
+    """Check a light and round its numbers to float32; None stays None. Raises InputError; `what` begins the message."""
+    if light is None:
+        return None
+    if not isinstance(light, Light) or light.kind not in ("point", "directional"):
+        kind = f'of kind "{light.kind}"' if isinstance(light, Light) else type(light).__name__
+        raise InputError(f"{what}: is {kind}; must be a mi_ring.Light, point or directional, or None")
+    vector, rgb = (
+        require_numbers(getattr(light, name), (3,), f"{what}: {name}").astype(float) for name in ("vector", "rgb")
+    )
+    if light.kind == "directional" and not vector.any():
+        raise InputError(f"{what}: vector is 0; must be the direction in which the light travels")
+    return Light(light.kind, vector, rgb)
 
 
 def position_of(emitter):

@@ -34,15 +34,16 @@ def parse(
 ) -> Any:  # fmt: skip
     """Parse the arguments of a command. Returns an instance of `config_type`, which is a dataclass.
 
-    `program`: name of the command in the help. `description`: beginning of the help; default: the docstring of the
-    dataclass. Raises InputError for wrong arguments. With `needs_llvm`, it also raises InputError if there is no LLVM.
+    `program`: name of the command in the help. `description`: beginning of the help, by --help or --help-all; default:
+    the docstring of the dataclass. Raises InputError for wrong arguments. With `needs_llvm`, it also raises InputError
+    if there is no LLVM, but not for the help.
     """
     for word in (*arguments, os.getcwd()):
         require_utf8(word)
-    box = io.StringIO()
+    words, box = ["--help" if word == "--help-all" else word for word in arguments], io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            config = tyro.cli(config_type, args=list(arguments), prog=program, default=default, description=description)
+            config = tyro.cli(config_type, args=words, prog=program, default=default, description=description)
     except SystemExit as stop:
         if not stop.code:
             raise
