@@ -41,7 +41,9 @@ HALF = math.sqrt(math.log(2) / 2) / math.pi  #: a Gaussian of this standard devi
 FINE = 8  #: the wavelength below which errors of novel views count as fine [px]
 SAMPLES = 2  #: rays per pixel and axis of a map
 MARGIN, FACING = 6, 0.5  #: of the region that is compared: from its border [px]; least cosine toward the camera
-STEEP, ALONG = 0.4, np.arange(-2, 6.01, 0.05)  #: least gradient at edges of colour [of the steepest]; profile [px]
+STEEP = 0.06  #: least gradient of red / (red + blue) at the edge of a stroke [1/px]; grain has none
+ALONG = np.arange(-2, 6.01, 0.05)  #: of profiles across such edges [px]
+VISIBLE = 0.02  #: least contrast at which an edge has a width [of the true contrast]
 
 
 def finer(camera: Camera) -> Photographs:
@@ -101,11 +103,11 @@ def bands(picture: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
 
 
 def profiles(truth: np.ndarray, others: list[np.ndarray], inside: np.ndarray) -> np.ndarray:
-    """Sum of profiles across the true edges of colour, and their number: (1 + others, `ALONG`, 4), dark side first."""
-    grey = truth.mean(-1)
-    gy, gx = (gaussian_filter(grey, 0.7, order=order) for order in ((1, 0), (0, 1)))
+    """Sum of profiles across the true edges of strokes, and their number: (1 + others, `ALONG`, 4), dark side first."""
+    hue = truth[..., 0] / np.maximum(truth[..., 0] + truth[..., 2], 1e-6)
+    gy, gx = (gaussian_filter(hue, 0.7, order=order) for order in ((1, 0), (0, 1)))
     steep = np.hypot(gx, gy)
-    y, x = np.nonzero(inside & (steep > STEEP * steep[inside].max(initial=0)))
+    y, x = np.nonzero(inside & (steep > STEEP))
     direction = np.stack([gy, gx])[:, y, x] / steep[y, x]
     before, here, after = (map_coordinates(steep, [y, x] + step * direction, order=1) for step in (-1, 0, 1))
     ridge = (here > before) & (here >= after)
@@ -172,8 +174,9 @@ class Comparison:
         found["colour, standard deviation %"], found["colour, true %"] = 100 * variation.mean(1)
         if self.edges[0, 0, 3]:
             (true, full), (width, contrast) = (rise((e[:, :3] * s).mean(1)) for e, s in zip(self.edges, (1, scale)))
-            found |= {"edges of colour, 10-90 % px": width, "edges of colour, true px": true,
-                      "contrast of edges, % of the true": 100 * contrast / full}  # fmt: skip
+            found |= {"edges of colour, true px": true, "contrast of edges, % of the true": 100 * contrast / full}
+            if contrast > VISIBLE * full:
+                found["edges of colour, 10-90 % px"] = width
         return {name: float(value) for name, value in found.items()}
 
 
@@ -209,9 +212,9 @@ def main() -> None:
         for maps, comparison in found.values():
             comparison.add(maps.of(shot.camera), expected, shot.camera)
     for run, (maps, comparison) in found.items():
-        columns[run.name] = comparison.numbers()
+        columns[str(run)] = comparison.numbers()
         if maps.ring is not None and (truth / "scene.xml").is_file():
-            columns[run.name] |= novel_errors(maps, load_capture(truth / "scene.xml"))
+            columns[str(run)] |= novel_errors(maps, load_capture(truth / "scene.xml"))
     names = dict.fromkeys(name for numbers in columns.values() for name in numbers)
     cell = lambda numbers, name: f"{numbers[name]:.2f}" if name in numbers else "-"  # noqa: E731
     rows = [[name, *(cell(numbers, name) for numbers in columns.values())] for name in names]

@@ -27,24 +27,25 @@ from mi_ring.system.files import write_file
 import cv2
 import numpy as np
 import trimesh
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.special import sph_harm_y
+from skimage.morphology import skeletonize
 
 KINDS = "relief", "print", "both"
 HARMONICS = {(2, 0): 0.12, (2, 1): 0.1, (3, 2): 0.16, (4, -3): 0.12}  #: (degree, order): part of the radius
 PAPER, INK = np.array([0.72, 0.62, 0.48]), np.array([0.08, 0.1, 0.22])  #: linear colours
 TEXT = "SPHINX OF BLACK QUARTZ, JUDGE MY VOW 0123456789 "
 CAP, LEADING = 7, 1.8  #: height of capitals [width of a stroke], distance of lines [height of capitals]
-WAVES, WAVELENGTHS = 160, (4.0, 32.0)  #: of the grain: number; range [px]
+WAVES, WAVELENGTHS = 120, (4.0, 32.0)  #: of the grain: number; range [px]
 DOTS, SOFT = 8, 0.4  #: dots per pixel of the drawn text; standard deviation of the blur of its edges [px]
 WRONG = 0.0388  #: --wrong-cameras that moves points by half a pixel, as `reprojection` measures
 
 
-def text_at(azimuth: np.ndarray, latitude: np.ndarray, radius: float, strokes: list[float], skip: int) -> np.ndarray:
+def text_at(azimuth: np.ndarray, latitude: np.ndarray, radius: float, widths: list[float], skip: int) -> np.ndarray:
     """Share of ink (V,) at points of the upper half of a sphere of this radius [px]. `skip`: letters of the text."""
     ink, place = np.zeros(len(azimuth)), 0.06
     for k in range(1000):
-        width = strokes[k % len(strokes)]
+        width = widths[k % len(widths)]
         high = CAP * width
         place += LEADING * high / radius / 2
         if place > 1.1:
@@ -52,9 +53,9 @@ def text_at(azimuth: np.ndarray, latitude: np.ndarray, radius: float, strokes: l
         scale, size = high * DOTS / 21, (int(2 * np.pi * radius * np.cos(place) * DOTS), int(2 * high * DOTS))
         line = np.zeros(size[::-1], np.uint8)
         words = np.roll(list(TEXT * 20), -skip - 7 * k)
-        cv2.putText(line, "".join(words), (0, int(1.5 * high * DOTS)), cv2.FONT_HERSHEY_SIMPLEX, scale, 255,
-                    round(width * DOTS), cv2.LINE_AA)  # fmt: skip
-        soft = cv2.GaussianBlur(line.astype(np.float32) / 255, (0, 0), SOFT * DOTS)
+        cv2.putText(line, "".join(words), (0, int(1.5 * high * DOTS)), cv2.FONT_HERSHEY_SIMPLEX, scale, 255)
+        strokes = distance_transform_edt(~skeletonize(line > 127)) < width * DOTS / 2  # whatever the font's own width
+        soft = cv2.GaussianBlur(strokes.astype(np.float32), (0, 0), SOFT * DOTS)
         near = np.abs(latitude - place) * radius < high
         across = azimuth[near] / (2 * np.pi) % 1 * size[0]
         down = (high - (latitude[near] - place) * radius) * DOTS
@@ -110,10 +111,9 @@ def detailed(kind: str, options: argparse.Namespace, config: SynthesizeConfig) -
         slope = np.tan(np.radians(options.slope))
         height = options.height * text_at(azimuth, latitude, mean / pixel, options.strokes, 0)
         height += slope * below * grain_at(mesh.vertices / pixel, np.random.default_rng([options.seed, 1]), 1)
-        mesh = trimesh.Trimesh(mesh.vertices + pixel * height[:, None] * mesh.vertex_normals, mesh.faces, process=False)
-        bent = np.degrees(
-            np.arccos(np.clip((mesh.vertex_normals * smooth_object(options.level)[0].vertex_normals).sum(1), -1, 1))
-        )
+        normals = mesh.vertex_normals
+        mesh = trimesh.Trimesh(mesh.vertices + pixel * height[:, None] * normals, mesh.faces, process=False)
+        bent = np.degrees(np.arccos(np.clip((mesh.vertex_normals * normals).sum(1), -1, 1)))
         print(f"    height {height.std():.2f} px rms, up to {height.max():.1f}; slope {np.sqrt(np.mean(bent**2)):.0f}° "
               f"rms, {np.quantile(bent, 0.99):.0f}° at the steepest hundredth")  # fmt: skip
     mesh.visual.vertex_colors = to_bytes(linear_to_srgb(colours))
@@ -133,7 +133,7 @@ def make(kind: str, options: argparse.Namespace) -> None:
     out = options.out / kind
     config = SynthesizeConfig(
         options.out / f"{kind}.ply", out, material="principled base_color=vertex_color roughness=0.4", fov=30.0,
-        size=(options.size, options.size), views=options.views, novel=8, format="png8", depth=3, spp=options.spp,
+        size=(options.size, options.size), views=options.views, novel=8, format="png8", depth=2, spp=options.spp,
         electrons=options.electrons, seed=options.seed,
     )  # fmt: skip
     write_file(config.mesh, detailed(kind, options, config).export(file_type="ply"))
