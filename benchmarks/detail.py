@@ -3,8 +3,9 @@
     python benchmarks/detail.py CAPTURE RUN [MORE …]
 
 CAPTURE is one that `detail_captures.py` has written, RUN a results folder, or a mesh with diffuse colours. In each
-photograph's exact camera the maps of normals and of diffuse colour are compared with the true ones. The columns of
-colour have one scale per channel. Novel views are compared inside the object.
+photograph's exact camera the maps of normals and of diffuse colour are compared with the true ones, where both surfaces
+are seen at less than 60°. Colours are compared after one scale per channel, in % of the mean colour. Novel views are
+compared inside the object.
 
 Prints a Markdown table with a column for each RUN, and then one line of JSON. The row "none" of a band is the error of
 a fit that has nothing in this band.
@@ -102,8 +103,8 @@ def bands(picture: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
     return [fine - coarse for fine, coarse in zip(levels, levels[1:])] + [levels[-1]]
 
 
-def profiles(truth: np.ndarray, others: list[np.ndarray], inside: np.ndarray) -> np.ndarray:
-    """Sum of profiles across the true edges of strokes, and their number: (1 + others, `ALONG`, 4), dark side first."""
+def profiles(truth: np.ndarray, fit: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Sums of profiles across the true edges of strokes, and their number: (2, `ALONG`, 4), dark side first."""
     hue = truth[..., 0] / np.maximum(truth[..., 0] + truth[..., 2], 1e-6)
     gy, gx = (gaussian_filter(hue, 0.7, order=order) for order in ((1, 0), (0, 1)))
     steep = np.hypot(gx, gy)
@@ -116,7 +117,7 @@ def profiles(truth: np.ndarray, others: list[np.ndarray], inside: np.ndarray) ->
     direction = direction[:, ridge]
     where = np.stack([c[:, None] + s[:, None] * ALONG for c, s in zip((y, x), direction)])
     sums = [[map_coordinates(picture[..., c], where, order=3).sum(0) for c in range(3)]
-            + [np.full(len(ALONG), len(y))] for picture in (truth, *others)]  # fmt: skip
+            + [np.full(len(ALONG), len(y))] for picture in (truth, fit)]  # fmt: skip
     return np.moveaxis(np.array(sums), 1, 2)
 
 
@@ -155,7 +156,7 @@ class Comparison:
         a, b = fit[1][core].astype(float), truth[1][core].astype(float)
         self.whole += [(a * a).sum(0), (a * b).sum(0), (b * b).sum(0)]
         self.mean += [a.sum(0), b.sum(0)]
-        self.edges += profiles(truth[1], [fit[1]], core)
+        self.edges += profiles(truth[1], fit[1], core)
 
     def numbers(self) -> dict[str, float]:
         """Errors by name."""

@@ -6,6 +6,7 @@ Writes three captures, and each of them again with cameras off by half a pixel: 
 OUT/print, smooth with print; OUT/both, with relief and another print; OUT/relief-off and so on. The upper half of the
 object has lines of text, the lower half grain of many wavelengths. All structure is in the mesh, not in textures;
 truth/mesh.ply has the diffuse colour as well. A pixel is one of the photographs, where the object faces the camera.
+There is no interreflection: fit with --no-indirect.
 """
 
 import argparse
