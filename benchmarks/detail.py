@@ -204,7 +204,7 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     options = parser.parse_args()
     truth = options.capture / "truth"
-    exact = next(file for file in (truth / "exact.xml", options.capture / "scene.xml") if file.is_file())
+    exact = next(file for file in (options.capture / "exact.xml", options.capture / "scene.xml") if file.is_file())
     capture = load_capture(exact, images=False)
     true, columns = Maps(truth / "mesh.ply", capture), {}
     found = {run: (Maps(run, capture), Comparison()) for run in options.runs}

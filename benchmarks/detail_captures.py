@@ -10,18 +10,20 @@ There is no interreflection: fit with --no-indirect.
 """
 
 import argparse
-import json
 import shutil
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.output.ply import write_ply
 from mi_ring.scene.plain_mesh import mesh_of
+from mi_ring.scene.shot import Shot
+from mi_ring.synthesis.degradation import miscalibrated
 from mi_ring.synthesis.object_on_table import load_object
 from mi_ring.synthesis.options import SynthesizeConfig
-from mi_ring.synthesis.path_traced_capture import SETTINGS, settings_of, write_capture
+from mi_ring.synthesis.path_traced_capture import write_capture
 from mi_ring.system.files import write_file
 
 # isort: split
@@ -39,7 +41,6 @@ TEXT = "SPHINX OF BLACK QUARTZ, JUDGE MY VOW 0123456789 "
 CAP, LEADING = 7, 1.8  #: height of capitals [width of a stroke], distance of lines [height of capitals]
 WAVES, WAVELENGTHS = 120, (4.0, 32.0)  #: of the grain: number; range [px]
 DOTS, SOFT = 8, 0.4  #: dots per pixel of the drawn text; standard deviation of the blur of its edges [px]
-WRONG = 0.0388  #: --wrong-cameras that moves points by half a pixel, as `reprojection` measures
 
 
 def text_at(azimuth: np.ndarray, latitude: np.ndarray, radius: float, widths: list[float], skip: int) -> np.ndarray:
@@ -121,12 +122,29 @@ def detailed(kind: str, options: argparse.Namespace, config: SynthesizeConfig) -
     return mesh
 
 
-def reprojection(capture: Path, exact: Path) -> float:
-    """Root mean square distance [px] between the true surface in the cameras of two scene files."""
-    points = trimesh.load(exact.parent / "mesh.ply", process=False).vertices[::997]
-    pairs = zip(load_capture(capture, images=False).shots, load_capture(exact, images=False).shots)
-    gaps = [a.camera.project(points)[0] - b.camera.project(points)[0] for a, b in pairs]
+def reprojection(shots: Sequence[Shot], others: Sequence[Shot], points: np.ndarray) -> float:
+    """Root mean square distance [px] between points (n, 3) in the cameras of two lists of photographs."""
+    gaps = [a.camera.project(points)[0] - b.camera.project(points)[0] for a, b in zip(shots, others)]
     return float(np.sqrt(np.square(gaps).sum(-1).mean()))
+
+
+def with_wrong_cameras(exact: Path, out: Path, points: np.ndarray, gap: float, seed: int) -> None:
+    """Copy a capture; cameras in the copy move points (n, 3) by `gap` [px], and exact.xml has the exact ones."""
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(exact, out)
+    (out / "scene.xml").rename(out / "exact.xml")
+    capture = load_capture(out / "exact.xml", images=False)
+
+    def turned(degrees: float) -> list[Shot]:
+        return list(miscalibrated(capture.shots, np.zeros(3), np.random.default_rng(seed), degrees))
+
+    degrees = 0.01
+    for _ in range(2):  # almost linear
+        degrees *= gap / reprojection(turned(degrees), capture.shots, points)
+    xml = capture.xml.replace(b'"calibrated" value="true"', b'"calibrated" value="false"')
+    write_file(out / "scene.xml", recalibrated_xml(xml, turned(degrees)))
+    found = load_capture(out / "scene.xml", images=False).shots
+    print(f"    cameras of {out.name}: off by {reprojection(found, capture.shots, points):.2f} px")
 
 
 def make(kind: str, options: argparse.Namespace) -> None:
@@ -143,12 +161,7 @@ def make(kind: str, options: argparse.Namespace) -> None:
     truth = mesh_of(mesh.vertices, mesh.faces)
     truth.add_attribute("vertex_diffuse", 3, np.ravel(colours))
     write_ply(truth, out / "truth/mesh.ply")
-    off = replace(config, out=options.out / f"{kind}-off", wrong_cameras=options.wrong_cameras)
-    shutil.copytree(out, off.out, dirs_exist_ok=True)  # the same photographs: only the scene file differs
-    write_file(off.out / SETTINGS, json.dumps(settings_of(off)))
-    write_capture(off)
-    write_ply(truth, off.out / "truth/mesh.ply")
-    print(f"    cameras off by {reprojection(off.out / 'scene.xml', off.out / 'truth/exact.xml'):.2f} px")
+    with_wrong_cameras(out, options.out / f"{kind}-off", mesh.vertices[::997], options.gap, options.seed)
 
 
 def main() -> None:
@@ -165,7 +178,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=40)
     parser.add_argument("--electrons", type=float, default=10_000)
     parser.add_argument("--spp", type=int, default=16)
-    parser.add_argument("--wrong-cameras", type=float, default=WRONG)
+    parser.add_argument("--gap", type=float, default=0.5, help="of wrong cameras, root mean square [px]")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
