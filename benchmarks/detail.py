@@ -158,8 +158,8 @@ class Comparison:
         self.mean += [a.sum(0), b.sum(0)]
         self.edges += profiles(truth[1], fit[1], core)
 
-    def numbers(self) -> dict[str, float]:
-        """Errors by name."""
+    def numbers(self) -> dict[str, float | None]:
+        """Errors by name; None for the width of edges that cannot be seen."""
         scale, mean, found = self.whole[1] / self.whole[0], self.mean / self.pixels, {}
         for k, band in enumerate(BANDS):
             found[f"normals {band}, error °"] = np.degrees(np.sqrt(self.turned[k] / self.pixels))
@@ -175,10 +175,12 @@ class Comparison:
         found["colour, standard deviation %"], found["colour, true %"] = 100 * variation.mean(1)
         if self.edges[0, 0, 3]:
             (true, full), (width, contrast) = (rise((e[:, :3] * s).mean(1)) for e, s in zip(self.edges, (1, scale)))
-            found |= {"edges of colour, true px": true, "contrast of edges, % of the true": 100 * contrast / full}
-            if contrast > VISIBLE * full:
-                found["edges of colour, 10-90 % px"] = width
-        return {name: float(value) for name, value in found.items()}
+            found |= {
+                "edges of colour, 10-90 % px": width if contrast > VISIBLE * full else None,
+                "edges of colour, true px": true,
+                "contrast of edges, % of the true": 100 * contrast / full,
+            }
+        return {name: None if value is None else float(value) for name, value in found.items()}
 
 
 def novel_errors(maps: Maps, novel: Capture) -> dict[str, float]:
@@ -217,8 +219,8 @@ def main() -> None:
         if maps.ring is not None and (truth / "scene.xml").is_file():
             columns[str(run)] |= novel_errors(maps, load_capture(truth / "scene.xml"))
     names = dict.fromkeys(name for numbers in columns.values() for name in numbers)
-    cell = lambda numbers, name: f"{numbers[name]:.2f}" if name in numbers else "-"  # noqa: E731
-    rows = [[name, *(cell(numbers, name) for numbers in columns.values())] for name in names]
+    values = ((name, [numbers.get(name) for numbers in columns.values()]) for name in names)
+    rows = [[name, *("-" if value is None else f"{value:.2f}" for value in found)] for name, found in values]
     print(table([options.capture.name, *columns], rows))
     print(json.dumps(columns))
 

@@ -23,7 +23,7 @@ SEEN = np.ones((150, 210), bool)
 X = np.arange(210) + 0.5
 
 
-def compared(fit: tuple, truth: tuple) -> dict[str, float]:
+def compared(fit: tuple, truth: tuple) -> dict:
     """The numbers of one view; each argument is (normals, colours)."""
     comparison = detail.Comparison()
     comparison.add((*fit, SEEN), (*truth, SEEN), CAMERA)
