@@ -272,7 +272,7 @@ def save_turned(pixels, path, orientation):
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_photographs_are_turned_as_pillow_turns_them(orientation, suffix, tmp_path):
     pixels = np.zeros((40, 64, 4 if suffix == "png" else 3), np.uint8)
-    pixels[4:12, 40:60] = 200
+    pixels[4:12, 40:60] = 255
     file = tmp_path / f"a.{suffix}"
     save_turned(pixels, file, orientation)
     with Image.open(file) as image:

@@ -163,4 +163,4 @@ def test_one_process_has_all_and_exchanges_nothing():
 @pytest.mark.slow
 def test_mistakes_are_told_once(folder):
     first, second = ((folder / f"mistake{k}.txt").read_text() for k in (0, 1))
-    assert first == "InputError('--iterations: is 0, must be at least 1')" and second == "SystemExit(2)"
+    assert first == "InputError('--iterations: is 0, must be 1 to 1,000,000')" and second == "SystemExit(2)"

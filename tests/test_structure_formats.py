@@ -316,7 +316,9 @@ def test_a_camera_without_an_aspect_ratio_has_that_of_its_photograph(tmp_path):
         for camera in content["cameras"]:
             del camera["perspective"]["aspectRatio"]
 
-    source = GltfCameras(structure_files.gltf(tmp_path, edit=edit), Path())
+    folder = tmp_path / "alone"  # beside tmp_path are folders of other tests, which may look like folders of masks
+    folder.mkdir()
+    source = GltfCameras(structure_files.gltf(folder, edit=edit), Path())
     agree(sorted(taken(source), key=lambda frame: frame.image), map(structure_files.gltf_pixels, range(3)))
     assert source.notes == [f"{source.src}: not used: KHR_lights_punctual (the light is where the options say)"]
 

@@ -34,11 +34,24 @@ class ObjectOnTable:
     def __init__(self, mesh: mi.Mesh, vertices: np.ndarray, tables: Iterable[mi.Object] = ()) -> None:
         """Join the object `mesh` and the shapes of the table. `vertices` (V, 3): the vertices of the object."""
         self.object, self.vertices, self.tables = mesh, vertices, list(tables)
+        self.scenes: dict[str, mi.Scene] = {}  #: by kind of light
 
     def under(self, emitter: mi.Object) -> mi.Scene:
         """Make the scene of object and table with this emitter as the only light."""
         shapes = {f"shape{k}": shape for k, shape in enumerate([self.object, *self.tables])}
         return mi.load_dict({"type": "scene", **shapes, "lamp": emitter}, optimize=False)
+
+    def lit_by(self, light: Light) -> mi.Scene:
+        """The scene with this light only, until the next call.
+
+        Lights of a kind share a scene, because it takes Mitsuba seconds to prepare a fine mesh for rays.
+        """
+        emitter = load_element(emitter_element(light))
+        if light.kind not in self.scenes:
+            self.scenes[light.kind] = self.under(emitter)
+        params = mi.traverse(self.scenes[light.kind])
+        params.update({f"lamp.{name}": value for name, value in mi.traverse(emitter)})
+        return self.scenes[light.kind]
 
     def radiance(
         self, view: LensCamera, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
@@ -48,19 +61,22 @@ class ObjectOnTable:
         `spp`: paths per pixel. `depth`: largest length of paths. `hidden`: an environment map is invisible to the
         camera; then, without a table, pixels away from the object are 0.
         """
-        trace: Any = partial(radiance_along, depth=depth, hidden=hidden)
         if isinstance(light, Light):
             middle = (self.vertices.min(0) + self.vertices.max(0)) / 2
             falloff = np.square(light.vector - middle).sum() if light.kind == "point" else 1.0
             white = light.rgb.max() / (np.pi * falloff)  # radiance of a white surface in the middle of the object
-            trace = partial(clamped_radiance_along, depth=depth, limit=BRIGHTEST * white)
-            light = load_element(emitter_element(light))
+            limit = BRIGHTEST * white
+            trace: Any = partial(clamped_radiance_along, scene=self.lit_by(light), depth=depth, limit=limit)
+        else:
+            trace = partial(radiance_along, scene=self.under(light), depth=depth, hidden=hidden)
         window = view.around(self.vertices) if hidden and not self.tables else (0, 0, *view.camera.size)
-        return pixel_means(partial(trace, scene=self.under(light)), view, window, spp, seed)
+        return pixel_means(trace, view, window, spp, seed)
 
     def coverage(self, view: LensCamera, spp: int = 64) -> np.ndarray:
         """Render the coverage (H, W): the share of each pixel that shows the object."""
-        trace = partial(hits_along, scene=self.under(mi.load_dict({"type": "constant"})), shape=self.object)
+        if "none" not in self.scenes:
+            self.scenes["none"] = self.under(mi.load_dict({"type": "constant"}))
+        trace = partial(hits_along, scene=self.scenes["none"], shape=self.object)
         return pixel_means(trace, view, view.around(self.vertices), spp, 0)[..., 0]
 
 
