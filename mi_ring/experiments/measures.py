@@ -32,7 +32,9 @@ BLACK = 1e-3  #: least BRDF [1/sr] that errors are relative to
 SLICE_LEVEL = 3  #: subdivisions: at these vertices materials are compared
 
 
-def evaluated(run: Run, folder: Path, options: ExperimentOptions, align: str | None = None, seen: bool = False) -> list[Row]:
+def evaluated(
+    run: Run, folder: Path, options: ExperimentOptions, align: str | None = None, seen: bool = False
+) -> list[Row]:
     """Return one row: the numbers of `mi-ring evaluate`, and the duration of the fit [s].
 
     Crossing and inverted triangles are in % of all triangles. `align`, `seen`: as for `evaluate`.
