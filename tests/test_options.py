@@ -43,7 +43,7 @@ def test_help_shows_what_users_set_and_says_how_many_more_options_there_are(caps
 
 
 @pytest.mark.parametrize("arguments", [["--help-all"], ["run", "--help-all"], ["--help"]])
-def test_all_commands_have_both_helps(arguments, capsys):
+def test_commands_without_hidden_options_have_both_helps(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
         export.main(arguments)
     assert not stop.value.code and "--subdivisions" in capsys.readouterr().out
@@ -80,16 +80,13 @@ def test_settings_of_all_kinds_are_read_as_they_were(tmp_path):
     ("{", "is not JSON"),
     ("[1]", "holds no settings"),
     ('{"solver": "euler"}', "solver: is no setting of mi_ring"),
-    ('{"iterations": "many"}', "iterations: is 'many', which this setting cannot be"),
-    ('{"iterations": true}', "iterations: is True"),
+    ('{"iterations": "many"}', "--iterations: is many, must be as mi-ring fit --help-all says"),
     ('{"blur": 0.06}', "blur: is no setting of mi_ring"),
-    ('{"decay": 1%s}' % ("0" * 400), "decay: is 1000"),
-    ('{"levels": [4, 5.5, 6]}', "levels: is [4, 5.5, 6]"),
-    ('{"parameters": {"haze": [0]}}', "parameters: is {'haze': [0]}"),
-    ('{"domain": ["mesh"]}', "domain: is ['mesh']"),
-    ('{"loss": "l3"}', "loss: is 'l3'"),
-    ('{"refine": ["gian"]}', "refine: is ['gian']"),
-    ('{"weights": {"mask": null}}', "weights: is {'mask': None}"),
+    ('{"levels": [4, 5.5, 6]}', "--levels: is 4 5.5 6"),
+    ('{"parameters": {"haze": [0]}}', "--parameters: is haze 0"),
+    ('{"domain": ["mesh"]}', "--domain: is mesh, must be auto, sphere, hull or (mesh, FILE)"),
+    ('{"loss": "l3"}', "--loss: is l3, must be one of l2"),
+    ('{"refine": ["gian"]}', "--refine: is gian, must be a list of names: auto, none"),
     ('{"learning_rate": -1}', "--learning-rate: is -1.0, must be above 0"),
     ('{"levels": [4]}', "--widths: is 128 256 512, must be as many values as --levels (1)"),
 ])  # fmt: skip
@@ -151,6 +148,10 @@ def test_an_unusable_option_is_one_line_that_names_it(options, words):
         ({"domain": ("mesh", 3)}, "--domain: is mesh 3"),
         ({"learning_rate": 10**400}, "--learning-rate: is 1000"),
         ({"loss": ["l1"]}, "--loss: is l1, must be one of l2"),
+        ({"refine": "cameras"}, "--refine: is cameras, must be a list of names"),
+        ({"refine": 3}, "--refine: is 3"),
+        ({"refine": [["cameras"]]}, "--refine: is cameras"),
+        ({"refine": ()}, "--refine: is empty"),
     ],
 )
 def test_settings_of_another_type_are_refused(settings, words):

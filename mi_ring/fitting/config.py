@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import json
 import math
-import reprlib
 from dataclasses import dataclass, field
 from itertools import repeat
 from numbers import Integral, Real
@@ -192,27 +191,22 @@ class Config(Ablation, Tuning, Common):
     def __post_init__(self) -> None:
         def require(condition: bool, name: str, what: str) -> None:
             if not condition:
-                raise InputError(f"--{name.replace('_', '-')}: is {as_typed(getattr(self, name))}, must be {what}")
+                raise InputError(f"--{name.replace('_', '-')}: is {as_typed(getattr(self, name))[:60]}, must be {what}")
 
-        require(not isinstance(self.refine, str), "refine", "a tuple of names")
         known = get_args(Unknown)
-        require(bool(self.refine) and set(self.refine) <= set(known), "refine", f"some of {', '.join(known)}")
+        wanted = {"refine": f"a list of names: {', '.join(known)}", "domain": "auto, sphere, hull or (mesh, FILE)"}
+        for f in dataclasses.fields(Config):  # for JSON and for calls from Python: the command line has checked them
+            if get_origin(f.type) is Literal:
+                wanted[f.name] = f"one of {', '.join(get_args(f.type))}"
+            try:
+                object.__setattr__(self, f.name, of_type(f.type, getattr(self, f.name)))
+            except (ValueError, OverflowError):  # OverflowError: an integer beyond the range of floats
+                require(False, f.name, wanted.get(f.name, "as mi-ring fit --help-all says"))
+        require(bool(self.refine), "refine", wanted["refine"])
         object.__setattr__(self, "refine", tuple(name for name in known if name in self.refine))  # in one order
         require("none" not in self.refine or len(self.refine) == 1, "refine", "none alone, or the names of unknowns")
         both = {"power", "gain"} <= set(self.refine)
         require(not both, "refine", "without power or without gain, for they look alike")
-
-        if isinstance(self.domain, tuple | list) and len(self.domain) == 2 and self.domain[0] == "mesh":
-            object.__setattr__(self, "domain", ("mesh", self.domain[1]))
-        else:
-            require(self.domain in ("auto", "sphere", "hull"), "domain", "auto, sphere, hull or (mesh, FILE)")
-        for f in dataclasses.fields(Config):  # for calls from Python: the command line has checked them
-            allowed = get_args(f.type) if get_origin(f.type) is Literal else ()
-            what = f"one of {', '.join(allowed)}" if allowed else "as mi-ring fit --help-all says"
-            try:
-                object.__setattr__(self, f.name, of_type(f.type, getattr(self, f.name)))
-            except (ValueError, OverflowError):  # OverflowError: an integer beyond the range of floats
-                require(False, f.name, what)
         for name, most in MOST.items():
             require(1 <= getattr(self, name) <= most, name, f"1 to {most:,}")
         require(1 <= self.frequencies <= 64, "frequencies", "1 to 64")
@@ -265,17 +259,9 @@ class Config(Ablation, Tuning, Common):
             raise InputError(f"{path}: is not JSON; {advice}") from error
         if not isinstance(entries, dict):
             raise InputError(f"{path}: holds no settings; {advice}")
-        kinds, settings = {f.name: f.type for f in dataclasses.fields(Config)}, {}
-        for name, value in entries.items():
-            if name in TASK:
-                continue
-            if name not in kinds:
-                raise InputError(f"{path}: {name}: is no setting of mi_ring {__version__}; remove it")
-            try:
-                settings[name] = of_type(kinds[name], value)
-            except (ValueError, OverflowError):  # OverflowError: an integer beyond the range of floats
-                raise InputError(f"{path}: {name}: is {reprlib.repr(value)}, which this setting cannot be; see "
-                                 "mi-ring fit --help-all") from None  # fmt: skip
+        settings = {name: value for name, value in entries.items() if name not in TASK}
+        if unknown := settings.keys() - {f.name for f in dataclasses.fields(Config)}:
+            raise InputError(f"{path}: {min(unknown)}: is no setting of mi_ring {__version__}; remove it")
         try:
             return Config(**settings)
         except InputError as error:
