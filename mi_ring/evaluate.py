@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mi_ring.errors import InputError, require_range
+from mi_ring.errors import InputError
 from mi_ring.metrics.evaluation import evaluate, evaluation_table, rounded
 from mi_ring.metrics.image_errors import SPP
 from mi_ring.output.ambiguity import ambiguity_of
@@ -56,7 +56,6 @@ class EvaluateConfig:
 def main(arguments: Sequence[str]) -> None:
     """Run the command with these arguments of the command line."""
     config = command.parse(EvaluateConfig, arguments, "mi_ring.evaluate")
-    require_range(config, "spp", 1)
     for name in ("scene.xml", "mesh.ply", "ring.pt"):
         if not (config.run / name).is_file():
             raise InputError(f"{config.run}: has no {name}; give the results folder of a finished fit")

@@ -46,17 +46,18 @@ class Colmap(Photogrammetry):
 
     @staticmethod
     def models(src: Path) -> list[Path]:
-        """List the folders of models in or below the folder `src`, in the first place that has some."""
-        inside = ([src / "sparse", *(src / "sparse").glob("*")], (src / "colmap/sparse").glob("*"), src.glob("*"))
-        return next((found for places in ([src], *inside) if (found := sorted(filter(is_model, places)))), [])
+        """List the folders of models in or below the folder `src`.
+
+        A model is in `src` itself, in its folder sparse or in a folder inside sparse, in a folder inside colmap/sparse,
+        or in a folder inside `src`. The first of these places that has a model is used.
+        """
+        sparse = src / "sparse"
+        places = [src], [sparse, *sparse.glob("*")], (src / "colmap/sparse").glob("*"), src.glob("*")
+        return next((found for place in places if (found := sorted(filter(is_model, place)))), [])
 
     @classmethod
     def model(cls, src: Path) -> Path | None:
-        """Find the model with the most photographs in or below the folder `src`.
-
-        The model is in `src` itself, in its folder sparse, or in a folder inside sparse, colmap/sparse or `src`. The
-        first of these places that has a model is used. If it has several, the one with the most photographs is used.
-        """
+        """Return the folder of `models` that has the most photographs. None if there is no model."""
         return max(cls.models(src), key=count_images, default=None)
 
     @property

@@ -12,7 +12,7 @@ from mi_ring.importers.frames import Source
 from mi_ring.importers.gltf_cameras import GltfCameras, has_cameras
 from mi_ring.importers.iron import Iron
 from mi_ring.importers.llff import Llff
-from mi_ring.importers.metashape import Metashape, find_chunk
+from mi_ring.importers.metashape import Metashape, chunks_of
 from mi_ring.importers.middlebury import Middlebury
 from mi_ring.importers.neus import Neus
 from mi_ring.importers.opensfm import OpenSfm
@@ -76,7 +76,7 @@ SIGNS = (
     Sign("colmap", "a model of COLMAP", (), Colmap.model),
     Sign("transforms", "transforms.json", Transforms.names,
          lambda path: path.name in Transforms.names or has("frames")(path)),
-    Sign("metashape", "*.xml of Metashape", ("*.xml",), lambda path: find_chunk(load_xml(path)) is not None),
+    Sign("metashape", "*.xml of Metashape", ("*.xml",), lambda path: chunks_of(load_xml(path))),
     Sign("realitycapture", "*.xmp or *.csv of RealityCapture", (), has_sidecars),
     Sign("realitycapture", "", ("*.csv",), lambda path: {"name", *POSE, "f"} <= {*read_csv(path)[0]}),
     Sign("llff", "poses_bounds.npy", (), has_files("poses_bounds.npy")),

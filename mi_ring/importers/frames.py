@@ -156,20 +156,22 @@ def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
 def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
     """Call `adapt` for all frames. Its messages are added to the notes of `source`.
 
-    If the sizes show that some photographs must be turned by their EXIF orientation, all are: a turn by 180 degrees
-    changes no size.
+    If the sizes show that some photographs must be turned by their EXIF orientation, all are whose size stays the same:
+    turned by 180 degrees, or square.
     """
     files = [frame for frame in frames if frame.pixels is None]
     turns = [orientation_of(frame.image) for frame in files]
     done = [adapt(frame, image_size(frame.image), turn) for frame, turn in zip(files, turns)]
-    rest = [k for k, turn in enumerate(turns) if turn > 1 == files[k].orientation]
-    if any(frame.orientation > 1 for frame in files):
-        for k in rest:
-            if turns[k] <= 4:
-                files[k].orientation, done[k] = turns[k], "; ".join(filter(None, [TURNED, done[k]]))
-    elif rest:
-        source.notes.append(f"{len(rest)} photographs not turned by their EXIF orientation: cameras are taken to be of "
-                            "the pixels as stored")  # fmt: skip
+    turned, left = any(frame.orientation > 1 for frame in files), 0
+    for k, (frame, turn) in enumerate(zip(files, turns)):
+        if turn > 1 == frame.orientation:
+            if turned and (turn <= 4 or frame.lens.size[0] == frame.lens.size[1]):
+                frame.orientation, done[k] = turn, "; ".join(filter(None, [TURNED, done[k]]))
+            else:
+                left += 1
+    if left:
+        source.notes.append(f"{left} photographs not turned by their EXIF orientation: cameras are taken to be of the "
+                            "pixels as stored")  # fmt: skip
     source.notes.extend(f"{count} {what}" for what, count in Counter(filter(None, done)).items())
 
 

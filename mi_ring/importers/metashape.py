@@ -67,11 +67,9 @@ class Metashape(Photogrammetry):
     )
 
     def posed(self) -> Iterator[Frame]:
-        root = load_xml(self.src)
-        if find_chunk(root) is None:
+        if not (chunks := chunks_of(load_xml(self.src))):
             raise InputError(f"{self.src}: SRC: is no <document> with a <chunk>; must be what File > Export > Export "
                              "Cameras of Metashape writes as Agisoft XML")  # fmt: skip
-        chunks = root.findall("chunk")
         chunk = chunks[self.largest([[*own.iterfind("cameras//camera/transform")] for own in chunks], "chunks")]
         self.tell_unused(self.src, xml_names(chunk, self.fields.closed))
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
@@ -113,9 +111,9 @@ class Metashape(Photogrammetry):
                               "with each other have places of their own: export one of them alone")  # fmt: skip
 
 
-def find_chunk(root: ElementTree.Element) -> ElementTree.Element | None:
-    """Return the <chunk> element of a Metashape XML file. Returns None for another kind of file."""
-    return root.find("chunk") if root.tag == "document" else None
+def chunks_of(root: ElementTree.Element) -> list[ElementTree.Element]:
+    """Return the <chunk> elements of a Metashape XML file. There are none in other kinds of files."""
+    return root.findall("chunk") if root.tag == "document" else []
 
 
 def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.Element | None:

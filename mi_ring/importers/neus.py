@@ -82,16 +82,15 @@ class Neus(Source):
     def masks(self, images: dict[int, Path]) -> dict[int, Path]:
         """Find the masks of the photographs `images`, by their numbers; empty without masks.
 
-        Masks have the names of the photographs, or are as many in the same order. Raises InputError if one is missing.
+        Masks have the names of the photographs, or other names and the same order. Raises InputError if one is missing.
         """
         folder = next((place for name in MASKS if (place := self.src / name).is_dir()), self.src / "mask")
         files = numbered_images(folder)
         by_name = {file.stem: file for file in files.values()}
         found = {k: by_name[image.stem] for k, image in images.items() if image.stem in by_name}
-        if len(found) < len(images) == len(files):
+        if len(found) < len(images) == len(files) and (not found or files.keys() == images.keys()):
             found = dict(zip(sorted(images), [files[n] for n in sorted(files)]))
         if files and (missing := sorted(images.keys() - found)):
-            raise InputError(
-                f"{folder}: no mask of photograph {missing[0]}, {images[missing[0]].name}; give all or none"
-            )
+            name = images[missing[0]].name
+            raise InputError(f"{folder}: no mask of photograph {missing[0]}, {name}; give all or none")
         return found

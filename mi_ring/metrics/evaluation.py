@@ -46,9 +46,9 @@ def evaluate(
     not defined, such as the genus of an open mesh, is missing.
     """
     if spp < 1:
-        raise InputError(f"spp: is {spp}, must be at least 1")
+        raise InputError(f"--spp: is {spp}, must be at least 1")
     if align not in (None, "rigid", "similarity"):
-        raise InputError(f"align: is {align!r}, must be rigid, similarity or None")
+        raise InputError(f"--align: is {align}, must be rigid or similarity")
     run, mesh = Path(run), Path(mesh)
     ring, capture = load_fit(run), load_capture(run / "scene.xml", width=COMPARED, crop=False)
     unseen = novel and load_capture(novel, width=COMPARED, crop=False)

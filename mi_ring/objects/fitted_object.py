@@ -88,7 +88,7 @@ class FittedObject(nn.Module):
         """
         level = self.subdivisions if level is None else level
         for name, value, least, most in (("spp", spp, 1, MOST_SPP), ("level", level, 0, FINEST)):
-            if not (isinstance(value, int) and least <= value <= most):
+            if not (isinstance(value, int | np.integer) and least <= value <= most):
                 raise InputError(f"{name}: is {value}, must be a whole number from {least} to {most:,}")
         shot = Shot("view", usable_camera(camera, "camera"), usable_light(light, "light"))
         try:

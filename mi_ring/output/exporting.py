@@ -75,7 +75,7 @@ def require_exportable(
     if kind not in KINDS:
         raise InputError(f"{file}: must end in {', '.join(KINDS)}")
     finest = MAX_PLY_LEVEL if kind == ".ply" else MAX_LEVEL
-    if subdivisions is not None and not (isinstance(subdivisions, int) and 0 <= subdivisions <= finest):
+    if subdivisions is not None and not (isinstance(subdivisions, int | np.integer) and 0 <= subdivisions <= finest):
         more = f"; textures have the finer detail; .ply takes up to {MAX_PLY_LEVEL}" * (finest == MAX_LEVEL)
         raise InputError(f"--subdivisions: is {subdivisions}, must be 0 to {finest}{more}")
     if not 64 <= resolution <= 4096:
