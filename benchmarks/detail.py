@@ -220,7 +220,7 @@ def main() -> None:
             columns[str(run)] |= novel_errors(maps, load_capture(truth / "scene.xml"))
     names = dict.fromkeys(name for numbers in columns.values() for name in numbers)
     values = ((name, [numbers.get(name) for numbers in columns.values()]) for name in names)
-    rows = [[name, *("-" if value is None else f"{value:.2f}" for value in found)] for name, found in values]
+    rows = [[name, *("-" if value is None else f"{value:.2f}" for value in row)] for name, row in values]
     print(table([options.capture.name, *columns], rows))
     print(json.dumps(columns))
 

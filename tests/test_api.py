@@ -335,6 +335,7 @@ def test_cameras_lights_and_levels_that_are_none_are_refused(finished):
     ):
         with pytest.raises(mi_ring.InputError, match=words):
             ring.render(**{"camera": camera, "light": light, "spp": 1, "level": 1} | changes)
+    assert ring.render(camera, light, spp=np.int64(1), level=np.int32(1)).shape == (*camera.size[::-1], 3)
     with pytest.raises(mi_ring.InputError, match="ring: is str; must be a fitted object"):
         mi_ring.export(str(finished), "a.ply")
     with pytest.raises(mi_ring.InputError, match="--subdivisions: is 1.5, must be 0 to 10"):

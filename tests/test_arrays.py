@@ -79,6 +79,11 @@ def test_masks_may_be_bool_and_some_may_be_missing():
     assert not seen.rgb[0, :, 0].any() and seen.clipped[0, :, 0].all()
 
 
+def test_names_may_come_from_an_iterator():
+    capture = made(images=[IMAGE] * 2, cameras=[CAMERA] * 2, names=iter(["b", "a"]))
+    assert [shot.name for shot in capture.shots] == ["b", "a"]
+
+
 def test_without_light_it_is_a_point_light_of_intensity_one_at_the_camera():
     capture = made()
     light = capture.photographs.lights[0]

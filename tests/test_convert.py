@@ -480,7 +480,12 @@ def test_wrong_counts_of_photographs_and_masks(tmp_path):
     source, out = neus(tmp_path / "dtu"), tmp_path / "out/scene.xml"
     (source / "mask/001.png").rename(source / "mask/aside")
     refused(["neus", source], "mask: no mask of photograph 1, 001.png; give all or none", out)
+    (source / "image/001.png").rename(tmp_path / "aside.png")  # as many masks now, but the names differ in one
+    (source / "mask/002.png").unlink()
     (source / "mask/aside").rename(source / "mask/001.png")
+    refused(["neus", source], "mask: no mask of photograph 2, 002.png; give all or none", out)
+    write(source / "mask/002.png", disc())
+    (tmp_path / "aside.png").rename(source / "image/001.png")
     for k in (3, 4):
         write(source / f"image/{k:03}.png", noise(np.uint8))
     refused(["neus", source], "world_mat: there are 3, but 5 photographs", out)

@@ -14,6 +14,7 @@ from trimesh.creation import box, icosphere, torus
 
 from mi_ring import evaluate, render
 from mi_ring.capture import loading, scenefile
+from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import genus
 from mi_ring.metrics import image_errors, surfaces
 from mi_ring.objects.fitted_object import FittedObject
@@ -338,4 +339,6 @@ def test_what_cannot_be_done_is_one_line(sphere_run, tmp_path, capsys):
         complaint = capsys.readouterr().err
         assert stop.value.code == 2 and complaint.count("\n") == 1, complaint
         assert all(word in complaint for word in words), complaint
+    with pytest.raises(InputError, match="--align: is affine, must be rigid or similarity"):
+        evaluate(sphere_run, truth, align="affine")
     assert not (sphere_run / "evaluation.json").exists()

@@ -195,12 +195,17 @@ def test_photographs_are_turned_as_their_cameras_are(tmp_path):
         Image.fromarray(np.ascontiguousarray(turn(upright))).save(folder / "a.png", exif=exif)
         exif[274] = 3  # its size says nothing, but the others' do
         Image.fromarray(np.ascontiguousarray(upright[::-1, ::-1])).save(folder / "b.png", exif=exif)
-        frames = [{"file_path": "a.png", "mask_path": "m.png", "transform_matrix": pose.tolist()},
-                  {"file_path": "b.png", "transform_matrix": pose.tolist()}]  # fmt: skip
+        exif[274] = orientation  # nor does the size of a square
+        square = np.ascontiguousarray(turn(upright[5:57]))
+        Image.fromarray(square).save(folder / "c.png", exif=exif)
+        frames = [{"file_path": "a.png", "mask_path": "m.png"}, {"file_path": "b.png"},
+                  {"file_path": "c.png", "w": 52, "h": 52, "cy": c[1] - 5}]  # fmt: skip
+        frames = [frame | {"transform_matrix": pose.tolist()} for frame in frames]
         top = {"fl_x": f[0], "fl_y": f[1], "cx": c[0], "cy": c[1], "w": size[0], "h": size[1], "frames": frames}
         (folder / "transforms.json").write_text(json.dumps(top))
         scene = converted("transforms", folder, tmp_path / f"{orientation}.xml")
-        assert all((image == upright).all() for image in scene.images)
+        expected = upright, upright, upright[5:57]
+        assert all((image == pixels).all() for image, pixels in zip(scene.images, expected, strict=True))
         assert (scene.masks[0] == upright[..., 0]).all()
 
 

@@ -148,13 +148,13 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
     """
     if names is None:
         return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
-    found = one_each(names, count, "names")
-    for k, name in enumerate(found):
+    names = listed(names, "names")
+    for k, name in enumerate(one_each(names, count, "names")):
         if not isinstance(name, str) or not NAME.fullmatch(name) or name == "object":
             raise InputError(f'names[{k}]: is {name!r}; must be a file name without suffix and $, not "object"')
-        if name in found[:k]:
+        if name in names[:k]:
             raise InputError(f"names[{k}]: {name!r} occurs twice")
-    return found
+    return names
 
 
 def room_of(room: ArrayLike) -> np.ndarray:

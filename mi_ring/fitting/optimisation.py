@@ -99,7 +99,7 @@ class Optimisation:
             solver.look(it)
         if not it.terms:
             return it
-        if not loss.requires_grad and not it.stage.settles:  # which outlines alone do not change
+        if not loss.requires_grad and not it.stage.settles:  # there `mask` has no gradient
             raise InputError(f"terms: {', '.join(it.terms)}: have no gradients, so the fit would change nothing; "
                              "compute them from it.prediction, by operations of PyTorch")  # fmt: skip
         self.backward(loss, it)

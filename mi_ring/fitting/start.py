@@ -32,7 +32,7 @@ DISPROPORTIONATE = 20.0  #: ratio of the sizes of the normalising sphere and the
 
 
 def require_settings(capture: Capture, config: Config) -> None:
-    """Raise InputError if a setting contradicts the capture, or if one of them is something else."""
+    """Raise InputError if a setting contradicts the capture, or if one of the two has another type."""
     for name, value, kind in (("capture", capture, Capture), ("config", config, Config)):
         if not isinstance(value, kind):
             raise InputError(f"{name}: is {type(value).__name__}, must be a mi_ring.{kind.__name__}")
@@ -50,7 +50,7 @@ def require_settings(capture: Capture, config: Config) -> None:
 
 
 class StateError(InputError):
-    """The state of another fit, or of none."""
+    """Error for a state that is not the state of such a fit."""
 
 
 @contextlib.contextmanager
@@ -66,7 +66,7 @@ def restoring() -> Iterator[None]:
 
 
 def restored(state: dict[str, Any]) -> tuple[Lighting, FittedObject]:
-    """Read lighting and object from the state of a fit. Raises InputError if it is none."""
+    """Read lighting and object from the state of a fit. Raises StateError if it has neither."""
     with restoring():
         return Lighting(*state["lighting"]), ring_of(state["ring"])
 

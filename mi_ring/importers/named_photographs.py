@@ -126,29 +126,20 @@ class NamedPhotographs(Source):
         """Find the masks of all frames, and set `mask` of each frame.
 
         With the option `masks`, they come from this folder. Raises InputError if a photograph has no mask there.
-        Without the option, they come from the alpha channels of the photographs, and then from a folder named masks
-        near the photographs. In this case, a photograph may have no mask.
+        Without the option, they come from the alpha channels of the photographs, and then from `masks_beside`. In this
+        case, a photograph may have no mask.
         """
         folder, root = self.masks, self.photograph_files.root
-        if folder is not None and not folder.is_dir():
-            raise InputError(f"{folder}: --masks: no such folder")
         if folder is None:
             for frame in frames:
                 if frame.mask is None and has_alpha(frame.image):
                     frame.mask = frame.image
             if all(frame.mask for frame in frames):  # or none at all
                 return
-            end = root.name.removeprefix("images") if root.name.startswith("images") else ""  # of images_2
-            beside = [place for above in (root.parent, root) for place in sorted(above.glob("[!.]*")) if place.is_dir()]
-            usual = {f"masks{end}": None} | dict.fromkeys(MASKS)
-            known = [place for name in usual for place in beside if place.name.lower() == name and place != root]
-            folder = next(iter(known), None)
-            stem = frames[0].image.stem
-            like = [place for place in beside if MASK_LIKE.search(place.name) and place not in (root, *known)]
-            if others := [place for place in like if any(f.name.startswith(stem) for f in place.glob("*"))]:
-                self.notes.append(f"{', '.join(map(str, others[:3]))}: not used; give --masks if it holds the masks")
-        if folder is None:
-            return
+            if (folder := self.masks_beside(root, frames[0].image.stem)) is None:
+                return
+        elif not folder.is_dir():
+            raise InputError(f"{folder}: --masks: no such folder")
         masks = PhotographFiles(images_below(folder), folder)
         wanted = [frame for frame in frames if frame.mask is None or self.masks is not None]
         paths = [f.image.relative_to(root).as_posix() if f.image.is_relative_to(root) else f.image.name for f in wanted]
@@ -172,6 +163,21 @@ class NamedPhotographs(Source):
             self.notes.append(f"{counted(without, 'photograph')} without a mask in {folder}: {few(without)}")
         if unused := [file.name for file in masks.files if file not in used]:
             self.notes.append(f"{counted(unused, 'mask')} in {folder} of no photograph: {few(unused)}")
+
+    def masks_beside(self, root: Path, stem: str) -> Path | None:
+        """Return the folder of masks beside or in `root`, the folder of the photographs. None if there is none.
+
+        Its name is one of `MASKS`, or masks_2 beside images_2. It adds a note about other folders that may contain
+        masks: a file in them has a name that begins with `stem`.
+        """
+        around = [place for above in (root.parent, root) for place in sorted(above.glob("[!.]*"))]
+        places = [place for place in around if place.is_dir() and place != root]
+        usual = dict.fromkeys(["masks" + root.name.lower().removeprefix("images"), *MASKS])
+        known = [place for name in usual for place in places if place.name.lower() == name]
+        like = [place for place in places if MASK_LIKE.search(place.name) and place not in known]
+        if others := [place for place in like if any(f.name.startswith(stem) for f in place.glob("*"))]:
+            self.notes.append(f"{', '.join(map(str, others[:3]))}: not used; give --masks if it holds the masks")
+        return next(iter(known), None)
 
 
 def counted(things: Sized, word: str) -> str:
