@@ -71,6 +71,8 @@ def test_masks_may_be_bool_and_some_may_be_missing():
     inside[1:4, 2:6] = True
     shown = np.ones((HEIGHT, WIDTH), np.uint8) * 255
     shown[:, 0] = 0
+    labelled = made(masks=[inside * np.uint8(3)])
+    np.testing.assert_array_equal(labelled.observe([0]).mask[0] == 1, inside)
     capture = made(images=[IMAGE, IMAGE], cameras=[CAMERA] * 2, masks=[None, inside], valid=[shown, None])
     seen = capture.observe([0, 1])
     assert seen.masked.tolist() == [False, True] and not seen.mask[0].any()

@@ -14,7 +14,7 @@ from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import photograph_element, room_elements, scene_bytes, scene_element
 from mi_ring.errors import LARGEST, InputError, require_numbers
 from mi_ring.geometry.camera import Camera, usable_camera
-from mi_ring.images import write_image
+from mi_ring.images import mask_values, write_image
 from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER
 from mi_ring.scene.lights import Light, usable_light
 from mi_ring.scene.shot import Encoding, Files, Shot
@@ -125,9 +125,10 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
     if array.dtype not in (np.uint8, bool) or array.shape != image.shape[:2]:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be {image.shape[:2]} of bool, or of "
                          "uint8 from 0 to 255")  # fmt: skip
-    if array.dtype == np.uint8 and array.max() == 1:
+    array = mask_values((array * np.uint8(255) if array.dtype == bool else array)[..., None])  # as of a file
+    if array.max() == 1:
         raise InputError(f"{what}: has 1 inside; must be bool, or uint8 with 255 inside")
-    return array if array.dtype == np.uint8 else np.where(array, 255, 0).astype(np.uint8)
+    return array
 
 
 def camera_of(camera: Camera | None, image: np.ndarray, what: str) -> Camera:

@@ -89,7 +89,7 @@ def entry(things: list, index: object, what: str) -> pygltflib.Property:
 def placed_nodes(gltf: pygltflib.GLTF2, path: Path) -> Iterator[tuple[int, np.ndarray]]:
     """Yield (node number, node-to-world transform (4, 4)) for each node.
 
-    Raises InputError if a node has several parents. The message begins with `path`.
+    Raises InputError if a node has several parents, or is inside itself. The message begins with `path`.
     """
     inner = {child for node in gltf.nodes for child in node.children or ()}
     waiting = [(k, np.eye(4)) for k in range(len(gltf.nodes)) if k not in inner]

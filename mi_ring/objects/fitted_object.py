@@ -19,7 +19,7 @@ from mi_ring.scene.assembly import assembled
 from mi_ring.scene.lights import Light, usable_light
 from mi_ring.scene.shot import Shot
 
-FINEST, MOST_SPP = 10, 10**4  #: level of the mesh, and samples per pixel, of a picture
+FINEST, MOST_SPP = 10, 10**4  #: largest level of the mesh and number of samples per pixel of a picture
 
 
 class FittedObject(nn.Module):
@@ -27,8 +27,8 @@ class FittedObject(nn.Module):
 
     `center` (3,), `radius`: normalising sphere [scene units]. `domain`: the start surface; default: the unit sphere.
     `parameters`: the BSDF parameters that Ψ predicts. `bsdf`: Mitsuba's XML of the BSDF that reads them. `indirect`:
-    the fit and its pictures include interreflection. `subdivisions`: level of the mesh at which the fit has sampled the
-    surface. `networks`: (Shape-Net Φ, BRDF-Net Ψ). Without them, the networks of the paper are made from `steps`,
+    the fit and its pictures include interreflection. `subdivisions`: level of the mesh in the results; finer levels are
+    less certain. `networks`: (Shape-Net Φ, BRDF-Net Ψ). Without them, the networks of the paper are made from `steps`,
     `scale` and `parameters`; see `mi_ring.nets.shape_net.Flow` and `mi_ring.nets.brdf_net.MaterialNet`.
 
     `ground` (2, 3): a point of the table below the object and the table's unit normal. Surface points below the table
@@ -84,7 +84,7 @@ class FittedObject(nn.Module):
         mesh; default: `subdivisions`. `shadows`: the object casts shadows on itself. The picture allows one backward
         pass to the parameters of both networks. Its gradients include moving outlines and shadows.
 
-        Raises InputError for something that is no camera or no light, and for numbers out of range.
+        Raises InputError if camera or light is invalid, and for numbers out of range.
         """
         level = self.subdivisions if level is None else level
         for name, value, least, most in (("spp", spp, 1, MOST_SPP), ("level", level, 0, FINEST)):
