@@ -195,6 +195,9 @@ BROKEN = {
     "another place than the object's": (xml(SHAPE, SHAPE + SPHERE.format(30).split("<float")[0].replace("400", "4e5")),
                                         [], ["small.xml: center and radius of the shapenet shape: are 4e+05, -150, 90",
                                              "has a radius of 2", "leave them out"]),
+    "another place than the object's, with its radius": (
+        xml(SHAPE, SHAPE + SPHERE.format(30).replace("400", "4e5")), [],
+        ["small.xml: center and radius of the shapenet shape: are 4e+05, -150, 90 and 30, but", "leave them out"]),
     "NaN as radius": (xml(SHAPE, SHAPE + SPHERE.format("nan")), [], ["small.xml", "radius is nan"]),
     "NaN as centre": (xml(SHAPE, SHAPE + SPHERE.format(30).replace("-150", "nan")), [], ["small.xml", "center is"]),
     "missing domain": (xml(SHAPE, SHAPE + '<string name="domain" value="none.ply"/>'), [],

@@ -28,7 +28,7 @@ from mi_ring.objects.ring_file import ring_of
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.system.optional import installed
 
-DISPROPORTIONATE = 20.0  #: ratio of the sizes of the normalising sphere and the start surface that is no choice
+DISPROPORTIONATE = 20.0  #: ratio of size, or distance in radii, of start surface and normalising sphere: a mistake
 
 
 def require_settings(capture: Capture, config: Config) -> None:
@@ -152,15 +152,14 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
 
 
 def require_normalised(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
-    """Raise InputError if the scene's normalising sphere has quite another size than the start surface, or place."""
-    size = float(np.ptp(domain.points, axis=0).max()) / 2
-    if not 1 / DISPROPORTIONATE < size < DISPROPORTIONATE:
-        raise InputError(
-            f"{capture.path}: center and radius of the shapenet shape: are {', '.join(f'{c:.4g}' for c in center)} and "
-            f"{radius:.4g}, but the surface that the fit starts from has a radius of {size * radius:.4g} about "
-            f"{', '.join(f'{c:.4g}' for c in center + radius * (domain.points.min(0) + domain.points.max(0)) / 2)}; "
-            "correct them or leave them out"
-        )
+    """Raise InputError if the start surface is far from the scene's normalising sphere, or of quite another size."""
+    low, high = domain.points.min(0), domain.points.max(0)
+    size = float((high - low).max()) / 2
+    if size <= 1 / DISPROPORTIONATE or np.abs(domain.points).max() >= DISPROPORTIONATE:
+        given, middle = (", ".join(f"{c:.4g}" for c in place) for place in (center, center + radius * (low + high) / 2))
+        raise InputError(f"{capture.path}: center and radius of the shapenet shape: are {given} and {radius:.4g}, but "
+                         f"the surface that the fit starts from has a radius of {size * radius:.4g} about {middle}; "
+                         "correct them or leave them out")  # fmt: skip
 
 
 def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
