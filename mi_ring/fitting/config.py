@@ -266,6 +266,8 @@ class Config(Ablation, Tuning, Common):
             return Config(**settings)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
+        except RecursionError as error:  # in the message about a value of many nested lists
+            raise InputError(f"{path}: holds no settings; {advice}") from error
 
     def settings(self) -> dict:
         """Return all settings as a dictionary that can be written as JSON."""
