@@ -211,6 +211,8 @@ def require_cameras(frames: Sequence[Frame]) -> None:
         if not np.isfinite(frame.lens.params).all() or min(frame.lens.focal) <= 0:
             raise InputError(f"{what}: its parameters are {', '.join(f'{p:g}' for p in frame.lens.params)}; must be "
                              "finite, with focal lengths above 0")  # fmt: skip
+        if frame.light and frame.light.kind == "directional" and not frame.light.vector.any():
+            raise InputError(f"{frame.image}: light: its direction is 0 0 0; must be the direction to the light")
         if frame.light and not (np.isfinite([frame.light.vector, frame.light.rgb]).all() and min(frame.light.rgb) >= 0):
             raise InputError(f"{frame.image}: light: is {frame.light.rgb} at {frame.light.vector}; "
                              "must be finite and not negative")  # fmt: skip

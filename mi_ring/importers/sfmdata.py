@@ -70,6 +70,9 @@ class SfmData(Photogrammetry):
     )  # fmt: skip
 
     def posed(self) -> Iterator[Frame]:
+        if self.src.suffix.lower() == ".abc":
+            raise InputError(f"{self.src}: SRC: is an Alembic file, which is not read; convert it to .sfm by "
+                             "Meshroom's node ConvertSfMFormat")  # fmt: skip
         top = load_json(self.src)
         if not isinstance(top, dict) or not isinstance(top.get("views"), list):
             raise InputError(f"{self.src}: views: is missing; must be a scene of Meshroom or OpenMVG")
