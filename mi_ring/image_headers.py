@@ -135,6 +135,16 @@ def tiff_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
     return page
 
 
+def tiff_channels(page: tifffile.TiffPage) -> int:
+    """Return how many channels of a TIFF page form the picture: its colours, and alpha if it has one.
+
+    A channel more is alpha unless the file calls it unspecified; then it may be infrared, for example.
+    """
+    colours = 3 if page.photometric in (tifffile.PHOTOMETRIC.RGB, tifffile.PHOTOMETRIC.YCBCR) else 1
+    unspecified = page.extrasamples[:1] == (tifffile.EXTRASAMPLE.UNSPECIFIED,)
+    return colours + (page.samplesperpixel > colours and not unspecified)
+
+
 def has_alpha_channel(path: Path) -> bool:
     """Test whether an image file has an alpha channel. Raises the errors of `open_image`."""
     suffix = path.suffix.lower()
@@ -145,7 +155,7 @@ def has_alpha_channel(path: Path) -> bool:
         return any(name.rpartition(".")[2] == "A" for name in names)
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:
-            return file.pages.first.samplesperpixel in (2, 4)
+            return tiff_channels(file.pages.first) in (2, 4)
     with open_image(path) as image:
         return image.has_transparency_data
 

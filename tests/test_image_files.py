@@ -438,6 +438,20 @@ def test_colours_of_palettes_and_their_alpha(tmp_path):
     assert not has_alpha(tmp_path / "b.png")  # opaque: says nothing
 
 
+@pytest.mark.parametrize(("kind", "count"), [(["unspecified"], 3), (["unassalpha"], 4), (None, 4)])
+@pytest.mark.parametrize("plane", ["contig", "separate"])
+def test_a_channel_more_of_tiff_is_alpha_unless_it_is_unspecified(tmp_path, kind, count, plane):
+    pixels = np.random.default_rng(2).integers(0, 255, (H, W, 4), np.uint8)
+    stored = pixels if plane == "contig" else np.moveaxis(pixels, -1, 0)
+    options = {"photometric": "rgb", "planarconfig": plane, "extrasamples": kind or ["unassalpha"]}
+    tifffile.imwrite(path := tmp_path / "a.tif", stored, **options)
+    if kind is None:  # some programs do not write the field
+        content = path.read_bytes()
+        path.write_bytes(content.replace((338).to_bytes(2, "little"), (65000).to_bytes(2, "little"), 1))
+    assert (pixels_of(path) == pixels[..., :count]).all() and has_alpha(path) == (count == 4)
+    assert ("ExtraSamples=unspecified" in image_fields.unused_fields(path)) == (count == 3)
+
+
 @pytest.mark.parametrize("write", [
     by_tiff(photometric="rgb"), exr_of("R", "G", "B"), exr_of("R", "G", "B", "Z"), by_pillow(".jpg"), by_pillow(".png"),
 ])  # fmt: skip
