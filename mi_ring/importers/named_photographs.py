@@ -13,6 +13,7 @@ from mi_ring.importers.frames import Frame, Source
 from mi_ring.importers.photograph_files import MASKS, PhotographFiles, name_of, refuse_twins
 from mi_ring.importers.reading import first_file, has_alpha, images_below
 
+MASK_AFFIX = re.compile(r"^masks?[-_. ]|[-_. ]masks?$", re.IGNORECASE)  #: in the names of masks, without suffix
 MASK_LIKE = re.compile("mask|segment|matte|alpha", re.IGNORECASE)  #: in the names of folders that may hold masks
 
 
@@ -27,8 +28,9 @@ class NamedPhotographs(Source):
     the names of their folders decide.
     Without this option: the places that SRC names, or the nearest folder `images` beside or above SRC."""
     masks: Path | None = None
-    """Folder of masks: photo.jpg has the mask photo.jpg.png, photo.png or photo.jpg.
-    Without this option: the masks that SRC names, alpha channels, or a folder `masks` beside the photographs."""
+    """Folder of masks: photo.jpg has the mask photo.jpg.png, photo.png, photo.jpg or photo_mask.png.
+    Without this option: the masks that SRC names, alpha channels, a folder `masks` beside the photographs, or
+    photo_mask.png among them."""
 
     def posed(self) -> Iterator[Frame]:
         """Yield the photographs that have a pose.
@@ -126,8 +128,9 @@ class NamedPhotographs(Source):
         """Find the masks of all frames, and set `mask` of each frame.
 
         With the option `masks`, they come from this folder. Raises InputError if a photograph has no mask there.
-        Without the option, they come from the alpha channels of the photographs, and then from a folder named masks
-        near the photographs. In this case, a photograph may have no mask.
+        Without the option, they come from the alpha channels of the photographs, then from a folder named masks near
+        the photographs, and then from files such as photo_mask.png among them. In these cases, a photograph may have no
+        mask.
         """
         folder, root = self.masks, self.photograph_files.root
         if folder is not None and not folder.is_dir():
@@ -147,9 +150,14 @@ class NamedPhotographs(Source):
             like = [place for place in beside if MASK_LIKE.search(place.name) and place not in (root, *known)]
             if others := [place for place in like if any(f.name.startswith(stem) for f in place.glob("*"))]:
                 self.notes.append(f"{', '.join(map(str, others[:3]))}: not used; give --masks if it holds the masks")
-        if folder is None:
+        shown = {frame.image for frame in frames}
+        files = [
+            file for file in (images_below(folder) if folder else self.photograph_files.files) if file not in shown
+        ]
+        if folder is None and not (files := [file for file in files if MASK_AFFIX.search(file.stem)]):
             return
-        masks = PhotographFiles(images_below(folder), folder)
+        folder = folder or root
+        masks = PhotographFiles(files or images_below(folder), folder, MASK_AFFIX)
         wanted = [frame for frame in frames if frame.mask is None or self.masks is not None]
         paths = [f.image.relative_to(root).as_posix() if f.image.is_relative_to(root) else f.image.name for f in wanted]
         found = [masks.find(path) for path in paths]
