@@ -1,5 +1,6 @@
 """Every kind of image file is read alike by all commands, and what it says about its colours is heeded."""
 
+import io
 import json
 import struct
 import zlib
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 from helpers.foreign_captures import colmap_folder, converted, disc, noise, transforms
-from PIL import Image, ImageCms, PngImagePlugin
+from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from mi_ring import convert, image_fields, image_headers, images
 from mi_ring.colour_profiles import Statement, as_stated, primaries_profile
@@ -384,6 +385,27 @@ def test_colours_are_found_by_the_names_of_the_channels(tmp_path, names, channel
     order = [name.rpartition(".")[2] for name in names if name.rpartition(".")[2] in "RGB"]
     assert pixels.shape == (H, W, channels)
     np.testing.assert_allclose(pixels[..., :3], stripes()[..., [order.index(c) for c in "RGB"]], atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"exif": True}])
+def test_a_jpeg_that_is_cut_off_is_not_converted(tmp_path, options):
+    """A preview in its EXIF data is whole; what follows its pixels is not of them."""
+    picture = Image.fromarray(np.random.default_rng(1).integers(0, 255, (40, 60, 3), np.uint8))
+    if "exif" in options:
+        preview = io.BytesIO()
+        picture.resize((8, 6)).save(preview, "JPEG")
+        exif = Image.Exif()
+        exif[ExifTags.Base.MakerNote] = preview.getvalue()
+        options = {"exif": exif}
+    picture.save(path := tmp_path / "a.jpg", **options)
+    whole = path.read_bytes()
+    for content in (whole, whole + bytes(500)):
+        path.write_bytes(content)
+        image_headers.require_whole(path)
+    for end in (-2, -200, 1500):
+        path.write_bytes(whole[:end])
+        with pytest.raises(ValueError, match="is cut off in its pixels; copy it again"):
+            image_headers.require_whole(path)
 
 
 def test_associated_alpha_of_tiff_is_undone(tmp_path):
