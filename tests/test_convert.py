@@ -140,6 +140,25 @@ def test_transforms_of_nerf(tmp_path):
     np.testing.assert_allclose(rgb[0].numpy()[inside], expected[inside], atol=1e-6)
 
 
+@pytest.mark.parametrize("top", [{"fl_x": 1.1, "cx": 0.5, "cy": 0.5}, {"fl_x": 70.0, "cx": 0, "cy": 0}])
+def test_intrinsics_that_are_not_in_pixels_are_refused(tmp_path, top):
+    folder = transforms(tmp_path / "in", top, [{"file_path": "0.png"}], lambda k: noise(np.uint8))
+    pattern = (
+        r"0.png: camera: its focal lengths and principal point are \S+ \S+ \S+ \S+, but its photograph has 62 x 52"
+    )
+    refused(["transforms", folder], pattern, tmp_path / "out/scene.xml")
+
+
+@pytest.mark.parametrize("place", ["", "images/"])
+def test_no_photograph_is_taken_for_a_mask_that_is_missing(tmp_path, place):
+    frames = [{"file_path": f"{place}{k}.png", "mask_path": f"D:/x/masks/{k}.png"} for k in range(2)]
+    folder = transforms(tmp_path / "in", {"fl_x": 70.0}, frames, lambda k: noise(np.uint8))
+    refused(["transforms", folder], r"frames\[0\].mask_path: no mask 'D:/x/masks/0.png'", tmp_path / "out/scene.xml")
+    for k in range(2):
+        write(folder / f"masks/{k}.png", disc())
+    assert all((mask == disc()[..., 0]).all() for mask in converted("transforms", folder, tmp_path / "s.xml").masks)
+
+
 def test_a_frame_may_have_another_kind_of_focal_length_than_the_file(tmp_path, capsys):
     frames = [{"file_path": f"train/{k}"} for k in range(3)]
     frames[1] |= {"camera_angle_x": 1.2}

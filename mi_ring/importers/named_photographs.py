@@ -98,8 +98,8 @@ class NamedPhotographs(Source):
                               f"photographs; not used: {others}")  # fmt: skip
         return best
 
-    def mask_at(self, path: str, what: str) -> Path:
-        """Return the mask file that the camera file calls `path`.
+    def mask_at(self, path: str, image: Path, what: str) -> Path:
+        """Return the mask file of the photograph `image` that the camera file calls `path`.
 
         `path` may be relative to the camera file. Otherwise a file of this name is looked for in and below the folder
         `masks`. Without this option, it is looked for below the folder of the camera file. Raises InputError if there
@@ -108,7 +108,8 @@ class NamedPhotographs(Source):
         if is_file(file := self.beside / path):
             return file
         folder = self.masks or self.beside
-        if found := PhotographFiles(images_below(folder), folder).find(path)[0]:
+        found, agrees = PhotographFiles([f for f in images_below(folder) if f != image], folder).find(path)
+        if found and agrees:
             return found
         raise InputError(f"{what}: no mask {path!r} in {folder}; give --masks, its folder, or take it out of the file")
 

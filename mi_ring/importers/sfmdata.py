@@ -144,7 +144,10 @@ class SfmData(Photogrammetry):
         values = top.get(name) or []
         if not isinstance(values, list):
             raise InputError(f"{self.src}: {name}: must be a list")
-        return {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
+        found = {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
+        if len(found) < len(values):
+            raise InputError(f"{self.src}: {name}: some have the same {key}; must be different")
+        return found
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[Frame]:
         """Yield one frame, that of the photograph `file`. Yields nothing if no image file is found for it."""

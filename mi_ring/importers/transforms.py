@@ -100,7 +100,7 @@ class Transforms(NamedPhotographs):
             mask = fields.get("mask_path")
             frame = Frame(image, camera, pose, said=name)
             if mask is not None:
-                frame.mask = self.mask_at(str(mask), f"{path}: {where}.mask_path")
+                frame.mask = self.mask_at(str(mask), image, f"{path}: {where}.mask_path")
             intensity = np.ones(3)
             if (rgb := fields.get("pl_intensity")) is not None:
                 rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb
