@@ -174,8 +174,8 @@ def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
         raise InputError(f"{what}: type: is {sensor.get('type')!r}; must be frame or fisheye; leave such "
                          "photographs out")  # fmt: skip
     shutter = sensor.find("property[@name='rolling_shutter']")
-    if shutter is not None and (kind := shutter.get("value", "")).lower() not in ("false", "0", "disabled"):
-        raise InputError(f"{what}: rolling_shutter: is {kind}, which is not supported; align without rolling shutter "
+    if shutter is not None and (state := shutter.get("value", "")).lower() not in ("false", "0", "disabled"):
+        raise InputError(f"{what}: rolling_shutter: is {state}, which is not supported; align without rolling shutter "
                          "compensation")  # fmt: skip
     calibration = sensor.find("calibration[@class='adjusted']")
     if calibration is None:
