@@ -126,9 +126,6 @@ def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
     if shot.encoding == "linear" and pixels.dtype == np.uint8:
         raise InputError(f'{scene}: photograph "{shot.name}", encoding: is linear, but {file.name} has 8 bits, which '
                          "is sRGB; leave it out, or give 16 bits or EXR if it is really linear")  # fmt: skip
-    if shot.saturation > 1 and pixels.dtype != np.float32:
-        raise InputError(f'{scene}: photograph "{shot.name}", saturation: is {shot.saturation:g}, but 1 is full scale '
-                         f"of {file.name}; divide it by the largest number")  # fmt: skip
     channels = pixels.shape[2]
     rgb = pixels[:, :, :3] if channels >= 3 else np.repeat(pixels[:, :, :1], 3, 2)
     if channels not in (2, 4) or pixels.dtype == np.float32:  # EXR files hold colours times alpha already
