@@ -5,7 +5,16 @@ from pathlib import Path
 import tifffile
 
 from mi_ring.fields import Fields
-from mi_ring.image_headers import RAW, TIFF, exr_attributes, exr_channels, exr_picture, open_image, png_chunks
+from mi_ring.image_headers import (
+    RAW,
+    TIFF,
+    exr_attributes,
+    exr_channels,
+    exr_picture,
+    open_image,
+    png_chunks,
+    tiff_channels,
+)
 
 ANIMATED = "further pictures; the first is read"
 TIFF_COLOURS = "WhitePoint PrimaryChromaticities TransferFunction"
@@ -39,7 +48,10 @@ FIELDS = {
             "ExtraSamples": "alpha channel", "InterColorProfile": "colours", "Orientation ExifTag": "EXIF data",
         },
         refused={"PhotometricInterpretation=*": "CMYK, Lab, raw sensors", "page:2": "several pictures"},
-        told={TIFF_COLOURS: "colours are read by the profile alone"},
+        told={
+            TIFF_COLOURS: "colours are read by the profile alone",
+            "ExtraSamples=unspecified": "a channel that the file does not call alpha",
+        },
         harmless={
             "NewSubfileType SubfileType SubIFDs PageN*": "previews",
             "XResolution YResolution ResolutionUnit XPosition YPosition": "its size on paper",
@@ -107,7 +119,9 @@ def field_names(path: Path) -> tuple[str, list[str]]:
         return "OpenEXR", [*(name.decode("utf-8", "replace") for name in attributes), *map("channel:{}".format, others)]
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:
-            return "TIFF", [tag.name for tag in file.pages.first.tags]
+            page = file.pages.first
+            more = page.samplesperpixel > tiff_channels(page) and "ExtraSamples" in page.tags
+            return "TIFF", [*(tag.name for tag in page.tags), *["ExtraSamples=unspecified"] * more]
     if suffix in RAW:
         return "raw", []
     with open_image(path) as image:

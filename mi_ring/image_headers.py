@@ -116,6 +116,15 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
+def require_whole(path: Path) -> None:
+    """Raise ValueError if a JPEG file ends before its pixels do. Pixels are not decoded."""
+    content, place = path.read_bytes() if path.suffix.lower() in BY_KIND["JPEG"] else b"", 2
+    while content[place : place + 1] == b"\xff" != content[place + 1 : place + 2] != b"\xda":  # before the first scan
+        place += 2 + int.from_bytes(content[place + 2 : place + 4], "big")
+    if content.startswith(b"\xff\xd8") and b"\xff\xd9" not in content[place:]:
+        raise ValueError("is cut off in its pixels; copy it again")
+
+
 def tiff_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
     """Return the first page of a TIFF file.
 
@@ -135,6 +144,16 @@ def tiff_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
     return page
 
 
+def tiff_channels(page: tifffile.TiffPage) -> int:
+    """Return how many channels of a TIFF page form the picture: its colours, and alpha if it has one.
+
+    A channel more is alpha unless the file calls it unspecified; then it may be infrared, for example.
+    """
+    colours = 3 if page.photometric in (tifffile.PHOTOMETRIC.RGB, tifffile.PHOTOMETRIC.YCBCR) else 1
+    unspecified = page.extrasamples[:1] == (tifffile.EXTRASAMPLE.UNSPECIFIED,)
+    return colours + (page.samplesperpixel > colours and not unspecified)
+
+
 def has_alpha_channel(path: Path) -> bool:
     """Test whether an image file has an alpha channel. Raises the errors of `open_image`."""
     suffix = path.suffix.lower()
@@ -145,7 +164,7 @@ def has_alpha_channel(path: Path) -> bool:
         return any(name.rpartition(".")[2] == "A" for name in names)
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:
-            return file.pages.first.samplesperpixel in (2, 4)
+            return tiff_channels(file.pages.first) in (2, 4)
     with open_image(path) as image:
         return image.has_transparency_data
 

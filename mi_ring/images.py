@@ -17,7 +17,17 @@ from torch.nn import functional as F
 from mi_ring.colour_profiles import as_stated
 from mi_ring.colour_profiles import srgb_to_linear as srgb_to_linear  # beside its inverse for those who read images
 from mi_ring.foreign import require_plausible_size
-from mi_ring.image_headers import RAW, TIFF, bits_of, exr_picture, exr_size, open_image, statement_of, tiff_page
+from mi_ring.image_headers import (
+    RAW,
+    TIFF,
+    bits_of,
+    exr_picture,
+    exr_size,
+    open_image,
+    statement_of,
+    tiff_channels,
+    tiff_page,
+)
 from mi_ring.system.files import write_file
 from mi_ring.system.machine import exr_threads
 from mi_ring.system.optional import need
@@ -102,6 +112,8 @@ def read_tiff(path: Path) -> np.ndarray:
         pixels = page.asarray()
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and pixels.ndim == 3:
             pixels = np.moveaxis(pixels, 0, -1)
+        if pixels.ndim == 3:
+            pixels = pixels[..., : tiff_channels(page)]
         if page.photometric == kinds.PALETTE:
             return (np.asarray(page.colormap)[:, pixels].transpose(1, 2, 0) >> 8).astype(np.uint8)
         if pixels.dtype == bool:

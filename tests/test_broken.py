@@ -27,6 +27,12 @@ def xml(pattern, new, count=1):
     return edit
 
 
+def included(path):
+    """Move the scene's content to a file that the scene includes."""
+    path.with_name("inner.xml").write_text(path.read_text())
+    path.write_text('<scene version="3.0.0"><include filename="inner.xml"/></scene>')
+
+
 def image(file, pixels):
     return lambda path: mi.Bitmap(np.asarray(pixels)).write(str(path.parent / file))
 
@@ -163,6 +169,13 @@ BROKEN = {
                             ["small.xml", '"000"', "to_world is missing"]),
     "a light that is nowhere": (xml('<point name="position"[^>]*>', "", 1), [],
                                 ["small.xml", '"000"', "emitter", "position is missing"]),
+    "a light without direction": (all_of(xml('<emitter type="point">', '<emitter type="directional">', 1),
+                                         xml('<point name="position"[^>]*>', "", 1),
+                                         xml("intensity", "irradiance", 1)), [],
+                                  ["small.xml", '"000"', "emitter", "direction is missing"]),
+    "a transposed pose": (pose(lambda m: m.T), [], ["small.xml", '"000"', "to_world", "last row", "transposed?"]),
+    "an included pose is missing": (all_of(xml('<transform name="to_world">.*?</transform>', "", 1), included), [],
+                                    ["inner.xml", '"000"', "to_world is missing"]),
     "another encoding than is said": (xml("<scene", '<?xml version="1.0" encoding="utf-16"?><scene', 1), [],
                                       ["small.xml: is no XML", "encoding"]),
     "an encoding that nobody knows": (xml("<scene", '<?xml version="1.0" encoding="klingon"?><scene', 1), [],

@@ -83,6 +83,19 @@ def test_diligent_mv(diligent, tmp_path):
     assert (tmp_path / "bear/truth/mesh.ply").read_bytes() == b"ply"
 
 
+def test_lines_of_lights_belong_to_those_of_file_names(diligent, tmp_path):
+    view = diligent / "view_02"
+    (view / "filenames.txt").write_text("004.png\r\n002.png\r\n001.png\r\n003.png\r\n")
+    scene = converted("diligent-mv", diligent, tmp_path / "a.xml", "--views", 2, "--lights", 1, 4)
+    assert [shot.files.filename.name for shot in scene.shots] == ["004.png", "003.png"]
+    np.testing.assert_allclose([shot.light.rgb for shot in scene.shots], INTENSITIES[[0, 3]], rtol=1e-5)
+    (view / "filenames.txt").write_text("004.png\n")
+    refused(["diligent-mv", diligent], "filenames.txt: has 1 lines, light_directions.txt 4", tmp_path / "b/b.xml")
+    (view / "filenames.txt").unlink()
+    (view / "light_directions.txt").write_text("0 0 0\n" * 4)
+    refused(["diligent-mv", diligent], "001.png: light: its direction is 0 0 0", tmp_path / "b/b.xml")
+
+
 def test_diligent_mv_takes_all_and_fills_holes_if_asked(diligent, tmp_path):
     scene = converted("diligent-mv", diligent, tmp_path / "bear.xml", "--fill-holes")
     assert len(scene) == 12
@@ -125,6 +138,39 @@ def test_transforms_of_nerf(tmp_path):
     assert not rgb[0].numpy()[~inside].any()  # what is transparent is black
     expected = images.srgb_to_linear(noise(np.uint8, 4, seed=1)[..., :3] / np.float32(255))
     np.testing.assert_allclose(rgb[0].numpy()[inside], expected[inside], atol=1e-6)
+
+
+@pytest.mark.parametrize("top", [{"fl_x": 1.1, "cx": 0.5, "cy": 0.5}, {"fl_x": 70.0, "cx": 0, "cy": 0}])
+def test_intrinsics_that_are_not_in_pixels_are_refused(tmp_path, top):
+    folder = transforms(tmp_path / "in", top, [{"file_path": "0.png"}], lambda k: noise(np.uint8))
+    pattern = (
+        r"0.png: camera: its focal lengths and principal point are \S+ \S+ \S+ \S+, but its photograph has 62 x 52"
+    )
+    refused(["transforms", folder], pattern, tmp_path / "out/scene.xml")
+
+
+@pytest.mark.parametrize("place", ["", "images/"])
+def test_no_photograph_is_taken_for_a_mask_that_is_missing(tmp_path, place):
+    frames = [{"file_path": f"{place}{k}.png", "mask_path": f"D:/x/masks/{k}.png"} for k in range(2)]
+    folder = transforms(tmp_path / "in", {"fl_x": 70.0}, frames, lambda k: noise(np.uint8))
+    refused(["transforms", folder], r"frames\[0\].mask_path: no mask 'D:/x/masks/0.png'", tmp_path / "out/scene.xml")
+    for k in range(2):
+        write(folder / f"masks/{k}.png", disc())
+    assert all((mask == disc()[..., 0]).all() for mask in converted("transforms", folder, tmp_path / "s.xml").masks)
+
+
+def test_a_frame_may_have_another_kind_of_focal_length_than_the_file(tmp_path, capsys):
+    frames = [{"file_path": f"train/{k}"} for k in range(3)]
+    frames[1] |= {"camera_angle_x": 1.2}
+    frames[2] |= {"intrinsic_matrix": K.tolist()}
+    folder = transforms(tmp_path / "in", {"fl_x": 50.0, "fl_y": 55.0}, frames, lambda k: noise(np.uint8, seed=k))
+    (folder / "transforms.json").rename(folder / "transforms_train.json")
+    (folder / "transforms_test.json").write_text("{}")
+    scene = converted("transforms", folder, tmp_path / "scene.xml")
+    angle = W / 2 / np.tan(0.6)
+    expected = [[50, 55], [angle, angle], [70, 76]]
+    np.testing.assert_allclose([shot.camera.focal for shot in scene.shots], expected, rtol=1e-6)
+    assert f"{folder}: not used: transforms_test.json; convert each to a scene" in capsys.readouterr().out
 
 
 def test_transforms_of_nerfstudio(tmp_path):
@@ -359,6 +405,14 @@ def test_wildlight(tmp_path):
     np.testing.assert_allclose(lights.rgb(), 36 * np.array([[2, 3, 4], [1, 1, 1]]), rtol=1e-6)
     np.testing.assert_allclose(scene.observe([0])[0][0], noise(np.uint8) / 255, atol=1e-6)
     assert scene.shots[0].saturation == pytest.approx(0.9)
+
+
+def test_a_number_of_neus_is_of_one_photograph(tmp_path):
+    folder = neus(tmp_path / "in")
+    (folder / "image").rename(folder / "images")
+    assert len(converted("neus", folder, tmp_path / "scene.xml").shots) == 3
+    shutil.copyfile(folder / "images/001.png", folder / "images/1.png")
+    refused(["neus", folder], "images/1.png: may be the same photograph as 001.png; keep one", tmp_path / "b/b.xml")
 
 
 @pytest.mark.parametrize("names", ["{:03}", "IMG_{}"])

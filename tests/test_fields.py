@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import scipy.io
-from helpers import foreign_captures, photogrammetry_files
+from helpers import foreign_captures, photogrammetry_files, structure_files
 from helpers.foreign_captures import converted, noise, transforms
 
 from mi_ring.errors import InputError
@@ -191,6 +191,12 @@ def iron(folder):
     return "iron", foreign_captures.iron(folder, lambda cameras: cameras["1.png"].update(distortion=[0.1]))
 
 
+def gltf(folder):
+    folder.mkdir()
+    moves = {"animations": [{"channels": [], "samplers": []}], "extensionsUsed": ["KHR_node_visibility", "KHR_mesh_x"]}
+    return "gltf", structure_files.gltf(folder, edit=lambda content: content.update(moves))
+
+
 def diligent(folder):
     folder = foreign_captures.diligent_folder(folder)
     file = folder / "Calib_Results.mat"
@@ -205,6 +211,7 @@ def diligent(folder):
      "sensor/vignetting (brightness of the corners; a fit may refine it)"),
     (sidecars, "xcr:LensShift (unknown)"), (sfmdata, "intrinsics/tilt (unknown)"),
     (neus, "distortion_0 (unknown)"), (iron, "distortion (unknown)"),
+    (gltf, "KHR_node_visibility (unknown), animations (cameras are taken from where they are without it)"),
     (diligent, "kc (distortion and skew, where they are not 0), lens_2 (unknown)"),
 ])  # fmt: skip
 def test_unknown_fields_are_named_once(make, told, tmp_path, capsys):
@@ -233,7 +240,10 @@ def test_fields_of_transforms_are_refused_unless_they_are_zero(name, tmp_path):
         converted("transforms", source, tmp_path / "refused.xml")
 
 
-def test_cameras_that_moved_during_the_exposure_are_refused_by_metashape(tmp_path):
-    _, path = metashape(tmp_path, '<property name="rolling_shutter" value="true"/>')
-    with pytest.raises(InputError, match="sensor '4': rolling_shutter: is true, which is not supported"):
+@pytest.mark.parametrize("value", ["true", "1", "regularized"])
+def test_cameras_that_moved_during_the_exposure_are_refused_by_metashape(tmp_path, value):
+    _, path = metashape(tmp_path, f'<property name="rolling_shutter" value="{value}"/>')
+    with pytest.raises(InputError, match=f"sensor '4': rolling_shutter: is {value}, which is not supported"):
         converted("metashape", path, Path(tmp_path / "s.xml"))
+    path.write_text(path.read_text().replace(f'value="{value}"', 'value="disabled"'))
+    assert len(converted("metashape", path, tmp_path / "s.xml").shots) == 3

@@ -219,6 +219,22 @@ def test_photographs_that_are_the_same_file_are_named(tmp_path):
         find_pictures(tmp_path)
 
 
+@pytest.mark.parametrize(("name", "pattern"), [
+    ("3_mask.png", "3_mask.png: FOLDER: looks like the mask of 3.png; move masks to a folder of their own"),
+    ("3.tif", "3.tif: FOLDER: has the name of 3.png; keep one of them, or move masks to a folder"),
+])  # fmt: skip
+def test_masks_among_the_photographs_are_refused(tmp_path, name, pattern):
+    for k in range(8):
+        Image.new("RGB", (20, 10), (k, 9, 8)).save(tmp_path / f"{k}.png")
+    Image.new("L", (20, 10), 255).save(tmp_path / name)
+    with pytest.raises(InputError, match=pattern):
+        find_pictures(tmp_path)
+    (tmp_path / "masks").mkdir()
+    moved = (tmp_path / name).rename(tmp_path / "masks" / name)
+    found = [picture.mask_file(tmp_path / "masks") for picture in find_pictures(tmp_path)]
+    assert found == [None] * 3 + [moved] + [None] * 4
+
+
 def test_a_broken_photograph_may_be_replaced(tmp_path):
     for k in range(8):
         Image.fromarray(np.full((6, 8, 3), 10 * k, np.uint8)).save(tmp_path / f"{k}.jpg")

@@ -1,5 +1,6 @@
 """Every kind of image file is read alike by all commands, and what it says about its colours is heeded."""
 
+import io
 import json
 import struct
 import zlib
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 from helpers.foreign_captures import colmap_folder, converted, disc, noise, transforms
-from PIL import Image, ImageCms, PngImagePlugin
+from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from mi_ring import convert, image_fields, image_headers, images
 from mi_ring.colour_profiles import Statement, as_stated, primaries_profile
@@ -386,6 +387,27 @@ def test_colours_are_found_by_the_names_of_the_channels(tmp_path, names, channel
     np.testing.assert_allclose(pixels[..., :3], stripes()[..., [order.index(c) for c in "RGB"]], atol=1e-6)
 
 
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"exif": True}])
+def test_a_jpeg_that_is_cut_off_is_not_converted(tmp_path, options):
+    """A preview in its EXIF data is whole; what follows its pixels is not of them."""
+    picture = Image.fromarray(np.random.default_rng(1).integers(0, 255, (40, 60, 3), np.uint8))
+    if "exif" in options:
+        preview = io.BytesIO()
+        picture.resize((8, 6)).save(preview, "JPEG")
+        exif = Image.Exif()
+        exif[ExifTags.Base.MakerNote] = preview.getvalue()
+        options = {"exif": exif}
+    picture.save(path := tmp_path / "a.jpg", **options)
+    whole = path.read_bytes()
+    for content in (whole, whole + bytes(500)):
+        path.write_bytes(content)
+        image_headers.require_whole(path)
+    for end in (-2, -200, 1500):
+        path.write_bytes(whole[:end])
+        with pytest.raises(ValueError, match="is cut off in its pixels; copy it again"):
+            image_headers.require_whole(path)
+
+
 def test_associated_alpha_of_tiff_is_undone(tmp_path):
     alpha = np.array([255, 128, 0, 60], np.uint8).repeat([9, 8, 7, 6])[None].repeat(H, 0)
     colours = eight(stripes())
@@ -436,6 +458,20 @@ def test_colours_of_palettes_and_their_alpha(tmp_path):
     assert pixels.shape == (H, W, 4) and (pixels[:, 17:24, 3] == 0).all() and (pixels[:, :17, 3] == 255).all()
     Image.fromarray(np.dstack([rgba[..., :3], np.full((H, W), 255, np.uint8)])).save(tmp_path / "b.png")
     assert not has_alpha(tmp_path / "b.png")  # opaque: says nothing
+
+
+@pytest.mark.parametrize(("kind", "count"), [(["unspecified"], 3), (["unassalpha"], 4), (None, 4)])
+@pytest.mark.parametrize("plane", ["contig", "separate"])
+def test_a_channel_more_of_tiff_is_alpha_unless_it_is_unspecified(tmp_path, kind, count, plane):
+    pixels = np.random.default_rng(2).integers(0, 255, (H, W, 4), np.uint8)
+    stored = pixels if plane == "contig" else np.moveaxis(pixels, -1, 0)
+    options = {"photometric": "rgb", "planarconfig": plane, "extrasamples": kind or ["unassalpha"]}
+    tifffile.imwrite(path := tmp_path / "a.tif", stored, **options)
+    if kind is None:  # some programs do not write the field
+        content = path.read_bytes()
+        path.write_bytes(content.replace((338).to_bytes(2, "little"), (65000).to_bytes(2, "little"), 1))
+    assert (pixels_of(path) == pixels[..., :count]).all() and has_alpha(path) == (count == 4)
+    assert ("ExtraSamples=unspecified" in image_fields.unused_fields(path)) == (count == 3)
 
 
 @pytest.mark.parametrize("write", [

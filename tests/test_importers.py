@@ -404,6 +404,20 @@ def test_mistakes_in_a_table(tmp_path, changes, pattern):
     refused(["realitycapture", csv_table(tmp_path, **changes)], pattern, tmp_path)
 
 
+def test_a_sidecar_is_of_one_photograph(tmp_path):
+    folder = sidecars(tmp_path / "in")
+    refused(
+        ["realitycapture", folder / "a.xmp"], "a.xmp: SRC: is the sidecar of one photograph; give its folder", tmp_path
+    )
+    (folder / "a.png").write_bytes((folder / "b.png").read_bytes())
+    refused(["realitycapture", folder], "a.png: may be the same photograph as a.JPG; keep one of them", tmp_path)
+
+
+def test_alembic_is_refused_with_what_to_do(tmp_path):
+    (tmp_path / "sfm.abc").write_bytes(b"Ogawa")
+    refused(["sfmdata", tmp_path / "sfm.abc"], "is an Alembic file, .* by Meshroom's node ConvertSfMFormat", tmp_path)
+
+
 def test_there_is_no_table_and_there_are_no_sidecars(tmp_path):
     refused(["realitycapture", photographs(tmp_path)], "no XMP sidecars in this folder", tmp_path)
     refused(["realitycapture", tmp_path / "gone.csv"], "gone.csv: text: no such file", tmp_path)

@@ -289,6 +289,24 @@ def test_masks_beside_the_photographs_are_found(tmp_path, kind, names, capsys):
     assert "1 photograph without a mask in" in printed and "1 mask in" in printed and "2 with masks" in printed
 
 
+@pytest.mark.parametrize("names", ["{}_mask.png", "mask_{}.PNG", "{}.mask.tif"])
+@pytest.mark.parametrize("place", ["masks", "images"])
+def test_masks_may_have_mask_in_their_names(tmp_path, names, place, capsys):
+    """Metashape exports x_mask.png, RealityCapture takes x.jpg.mask.png."""
+    path = metashape(tmp_path)
+    (tmp_path / place).mkdir(exist_ok=True)
+    for level, name in zip((10, 20, 30), NAMES):
+        stem = name if names.startswith("{}.") else name.split(".")[0]
+        pixels = np.full(SIZE[::-1], level, np.uint8)
+        pixels[0, 0] = 200
+        Image.fromarray(pixels).save(tmp_path / place / names.format(stem))
+    options = [["--masks", str(tmp_path / place)], []]
+    for k, more in enumerate(options):
+        scene = converted("metashape", path, tmp_path / f"{k}.xml", *more)
+        assert [int(mask[1, 1]) for mask in scene.masks] == [10, 20, 30]
+    assert "without a camera" not in capsys.readouterr().out
+
+
 def test_masks_that_are_named_otherwise_are_told(tmp_path, capsys):
     path = metashape(tmp_path)
     (tmp_path / "masks").mkdir()

@@ -97,6 +97,15 @@ def test_a_bundle_file_without_its_list(tmp_path):
     refused(["bundler", path], "bundle.out: list.txt: found neither .*list.txt nor .*list.txt", tmp_path)
 
 
+@pytest.mark.parametrize("make", [structure_files.bundler, structure_files.visualsfm])
+def test_a_byte_order_mark_is_no_part_of_the_content(tmp_path, make):
+    path = make(tmp_path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    name, src = guess(tmp_path)
+    assert name == make.__name__
+    agree(taken(FORMATS[name](src, Path())), map(getattr(structure_files, f"{name}_pixels"), range(3)))
+
+
 # VisualSFM
 
 
@@ -110,6 +119,7 @@ def test_visualsfm(tmp_path, fixed):
 @pytest.mark.parametrize(("old", "new", "pattern"), [
     ("NVM_V3", "NVM_V3_R9T", "begins with 'NVM_V3_R9T'; must be a file of VisualSFM's, NVM_V3"),
     ("NVM_V3", "NVM_V3 FixedK 70 0 70 0 0", "FixedK: the principal point, 0 0, is far from the middle"),
+    ("NVM_V3", "NVM_V3 FixedK 70 30 70 26 0.3", "a.JPG': radial.* is -0.15, but that of FixedK is 0.3"),
     ("NVM_V3", "NVM_V3 FixedK 70 0", r"FixedK fx cx fy cy: is of shape \(2,\)"),
     ("\n3\n", "\n30\n", "has 7 of the 30 cameras"),
     ("\n3\n", "\nthree\n", "found 'three' where the number of cameras or points must be"),
@@ -272,6 +282,13 @@ def test_record3d(tmp_path, varying):
     assert not source.notes
 
 
+def test_record3d_is_found_by_its_file_and_has_one_photograph_of_a_number(tmp_path):
+    folder = structure_files.record3d(tmp_path)
+    assert guess(folder) == guess(folder / "metadata.json") == ("record3d", folder / "metadata.json")
+    (folder / "rgb" / "01.png").write_bytes((folder / "rgb" / "1.jpg").read_bytes())
+    refused([folder], "1.jpg: may be the same photograph as 01.png; keep one of them", tmp_path)
+
+
 def test_photographs_of_record3d_may_be_reduced_and_padded(tmp_path):
     structure_files.record3d(tmp_path, edit=lambda own: own.update(w=124, h=104))
     for k in range(3):
@@ -386,7 +403,7 @@ def test_photographs_that_exif_turns(tmp_path, name):
 NEW = {
     "bundler": (structure_files.bundler, "bundle/bundle.out"), "visualsfm": (structure_files.visualsfm, "model.nvm"),
     "opensfm": (structure_files.opensfm, "opensfm/reconstruction.json"), "polycam": (structure_files.polycam, ""),
-    "record3d": (structure_files.record3d, ""), "gltf": (structure_files.gltf, "cameras.gltf"),
+    "record3d": (structure_files.record3d, "metadata.json"), "gltf": (structure_files.gltf, "cameras.gltf"),
 }  # fmt: skip
 OTHERS = {
     "colmap": (structure_files.colmap_rig, ""), "metashape": (photogrammetry_files.metashape, "cameras.xml"),

@@ -27,6 +27,7 @@ from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.scene.xml_elements import require_parts
 from mi_ring.system.progress import progress
 
+PLACES = {"point": "position", "directional": "direction"}  #: what says where a light is
 MANY = 2**28  #: if photographs have more pixels in total, at first only their headers are read
 
 
@@ -160,10 +161,12 @@ def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
     return [sensor for sensor in scene.sensors() if isinstance(sensor, photograph.Photograph)]
 
 
-def require_xml(path: Path) -> None:
-    """Raise InputError if the XML is invalid, or if a photograph or its point light has no position.
+def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
+    """Raise InputError if the XML is invalid, or if a photograph or its light has no place.
 
-    Without a position, Mitsuba would use the origin. Raises UnicodeDecodeError if the file is not UTF-8.
+    Without a place, Mitsuba would use the origin. It would ignore the last row of a matrix. Files that the scene
+    includes are checked, too; `above`: the files that include this one. Raises UnicodeDecodeError if the file is not
+    UTF-8.
     """
     content = path.read_bytes()
     content.decode("utf-8")
@@ -176,10 +179,28 @@ def require_xml(path: Path) -> None:
         name = f'{path}: photograph "{sensor.get("id", "")}"'
         if sensor.find("*[@name='to_world']") is None:
             raise InputError(f"{name}: to_world is missing; give the pose of its camera")
-        for light in sensor.findall("emitter[@type='point']"):
-            if not {"position", "to_world"} & {child.get("name") for child in light}:
-                raise InputError(f"{name}: emitter: position is missing; give it, or leave out the emitter if the "
+        for element in sensor.iterfind("transform/matrix"):
+            row = element.get("value", "").replace(",", " ").split()[12:]
+            if len(row) == 4 and not is_affine(row):
+                raise InputError(f"{name}: to_world: the last row of its matrix is {' '.join(row)}, must be 0 0 0 1; "
+                                 "is it transposed?")  # fmt: skip
+        for light in sensor.findall("emitter"):
+            place = PLACES.get(light.get("type", ""))
+            if place and not {place, "to_world"} & {child.get("name") for child in light}:
+                raise InputError(f"{name}: emitter: {place} is missing; give it, or leave out the emitter if the "
                                  "light is at the camera")  # fmt: skip
+    for element in root.iter("include"):
+        inner = (above or (path,))[0].parent / element.get("filename", "")
+        if inner.is_file() and inner not in (*above, path):  # Mitsuba refuses the others
+            require_xml(inner, (*above, path))
+
+
+def is_affine(row: Sequence[str]) -> bool:
+    """Return whether the last `row` of a matrix is 0 0 0 1. It is also true if these are no numbers."""
+    try:
+        return bool(np.allclose([float(word) for word in row], [0, 0, 0, 1]))
+    except ValueError:  # parameters, and words that Mitsuba refuses
+        return True
 
 
 def load_views(path: Path) -> list[MaskedCamera]:

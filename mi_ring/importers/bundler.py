@@ -67,7 +67,7 @@ def read_cameras(path: Path) -> np.ndarray:
     """Read the cameras (N, 5, 3) of a bundle file. The five rows of a camera: (f, k1, k2), the three rows of R, t."""
 
     def read(file: Path) -> tuple[list[str], list[str]]:
-        with file.open(encoding="utf-8") as text:
+        with file.open(encoding="utf-8-sig") as text:
             head = list(islice(text, 2))
             return head, list(islice(text, 5 * count_in(head, path)))
 

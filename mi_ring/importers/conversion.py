@@ -9,7 +9,7 @@ from pathlib import Path
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.image_fields import unused_fields
-from mi_ring.image_headers import KINDS, encoding_of, encodings
+from mi_ring.image_headers import KINDS, encoding_of, encodings, require_whole
 from mi_ring.importers.frames import Frame, Source, adapt_all, frames_of, require_frames
 from mi_ring.importers.named_photographs import counted, few
 from mi_ring.importers.photograph_files import parts_of, stem_of
@@ -35,6 +35,8 @@ def write_scene(source: Source) -> list[Frame]:
     adapt_all(source, frames)
     require_frames(frames, source.src)
     for frame in frames:
+        if frame.pixels is None:
+            read_as(frame.image, "image", require_whole)
         if frame.pixels is None and "auto" == source.encoding == frame.encoding:
             read_as(frame.image, "image", encoding_of)  # refuses HDR curves and unknown profiles
     # Scene files take a $ for a parameter.

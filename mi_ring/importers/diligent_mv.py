@@ -10,7 +10,7 @@ from mi_ring.errors import InputError
 from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import camera_to_world, pinhole_lens
 from mi_ring.importers.frames import OPENGL, Frame, Light, Source
-from mi_ring.importers.reading import chosen, entry, existing, image_size, load_mat, load_table
+from mi_ring.importers.reading import chosen, entry, existing, image_size, load_lines, load_mat, load_table
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class DiligentMV(Source):
         used={
             "KK": "calibration matrix", "Rc_* Tc_*": "poses, world-to-camera",
             "light_directions.txt light_intensities.txt": "lights", "mask.png": "masks", "mesh_Gt.ply": "the truth",
+            "filenames.txt": "the photograph of each light",
         },
         told={"kc alpha_c": "distortion and skew, where they are not 0"},
         harmless={
@@ -32,7 +33,7 @@ class DiligentMV(Source):
             "x_* y_* X_* Y_* dX* dY* n_sq_x* n_sq_y* wintx* winty* nx ny map": "the pattern that calibrated the camera",
             "n_ima active_images ind_active image_numbers calib_name format_image type_numbering": "its pictures",
             "first_num N_slots solution* param* est_* center_optim check_cond MaxIter recompute_extrinsic": "settings",
-            "__*": "the head of the file", "normal_gt.* *.jpg filenames.txt": "other files",
+            "__*": "the head of the file", "normal_gt.* *.jpg": "other files",
         },
     )  # fmt: skip
 
@@ -63,10 +64,15 @@ class DiligentMV(Source):
             if len(directions) != len(intensities):
                 raise InputError(f"{folder / 'light_intensities.txt'}: has {len(intensities)} lines, "
                                  f"light_directions.txt {len(directions)}; must be as many")  # fmt: skip
+            listed = folder / "filenames.txt"
+            names = [f"{k:03}.png" for k in range(1, len(directions) + 1)]
+            if listed.is_file() and len(names := load_lines(listed)) != len(directions):
+                raise InputError(f"{listed}: has {len(names)} lines, light_directions.txt {len(directions)}; must be "
+                                 "as many")  # fmt: skip
             for light in chosen(self.lights, range(1, len(directions) + 1), "--lights", folder):
                 to_light = pose[:3, :3] @ OPENGL[:3, :3] @ directions[light - 1]
                 yield Frame(
-                    existing(folder / f"{light:03}.png", "photograph"), camera, pose, mask,
+                    existing(folder / names[light - 1].strip(), "photograph"), camera, pose, mask,
                     Light("directional", -to_light, intensities[light - 1]), name=f"{view:02}_{light:03}",
                     fill_mask=self.fill_holes,
                 )  # fmt: skip

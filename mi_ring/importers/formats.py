@@ -66,9 +66,9 @@ def has_keyframes(folder: Path) -> bool:
 
 
 def begins(path: Path, word: bytes) -> bool:
-    """Return whether the first bytes of a file are `word`."""
+    """Return whether the first bytes of a file, after a byte order mark of UTF-8, are `word`."""
     with path.open("rb") as file:
-        return file.read(len(word)) == word
+        return file.read(3 + len(word)).removeprefix(b"\xef\xbb\xbf").startswith(word)
 
 
 #: In the order in which `detect` takes them.
@@ -82,14 +82,15 @@ SIGNS = (
     Sign("llff", "poses_bounds.npy", (), has_files("poses_bounds.npy")),
     Sign("middlebury", "*_par.txt", ("*_par.txt",), lambda path: path.name.endswith("_par.txt")),
     Sign("sfmdata", "*.sfm or sfm_data.json", ("cameras.sfm", "sfm.json", "sfm_data.json", "*.sfm"),
-         has("poses", "extrinsics")),
+         lambda path: has("views")(path) and has("poses", "extrinsics")(path)),
     Sign("bundler", "bundle.out", (*Bundler.names, "*.bundle.out", "bundle.rd.out"),
          lambda path: begins(path, FIRST_LINE.encode())),
     Sign("visualsfm", "*.nvm", ("*.nvm",), lambda path: begins(path, b"NVM_V3")),
     Sign("opensfm", "reconstruction.json", OpenSfm.names,
          lambda path: isinstance(top := load_json(path), list) and isinstance(top[0], dict) and "shots" in top[0]),
     Sign("polycam", "keyframes of Polycam", (), has_keyframes),
-    Sign("record3d", "metadata.json of Record3D", (), lambda path: has("poses")(path / "metadata.json")),
+    Sign("record3d", "metadata.json of Record3D", Record3D.names,
+         lambda path: path.name in Record3D.names and has("poses")(path)),
     Sign("gltf", "*.glb or *.gltf with cameras", ("*.glb", "*.gltf"), has_cameras),
     Sign("neus", "cameras_sphere.npz", (), has_files("cameras_sphere.npz", "cameras.npz")),
     Sign("iron", "cam_dict_norm.json", (), has_files(*Iron.names)),

@@ -21,6 +21,7 @@ from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 
 TURNED = "photographs turned upright by EXIF, as their cameras are"
+MIN_FOCAL = 0.1  #: least focal length, by the longer side of the photograph: 157 degrees
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: from OpenGL's camera axes (x right, y up, z back) to OpenCV's
 
 
@@ -213,6 +214,13 @@ def require_cameras(frames: Sequence[Frame]) -> None:
         if not np.isfinite(frame.lens.params).all() or min(frame.lens.focal) <= 0:
             raise InputError(f"{what}: its parameters are {', '.join(f'{p:g}' for p in frame.lens.params)}; must be "
                              "finite, with focal lengths above 0")  # fmt: skip
+        if min(frame.lens.focal) < MIN_FOCAL * max(frame.lens.size) or not any(frame.lens.centre):
+            numbers = " ".join(f"{number:.4g}" for number in (*frame.lens.focal, *frame.lens.centre))
+            size = "{} x {}".format(*frame.lens.size)
+            raise InputError(f"{what}: its focal lengths and principal point are {numbers}, but its photograph has "
+                             f"{size} pixels; must be in pixels, from its upper left corner")  # fmt: skip
+        if frame.light and frame.light.kind == "directional" and not frame.light.vector.any():
+            raise InputError(f"{frame.image}: light: its direction is 0 0 0; must be the direction to the light")
         if frame.light and not (np.isfinite([frame.light.vector, frame.light.rgb]).all() and min(frame.light.rgb) >= 0):
             raise InputError(f"{frame.image}: light: is {frame.light.rgb} at {frame.light.vector}; "
                              "must be finite and not negative")  # fmt: skip

@@ -35,10 +35,15 @@ class GltfCameras(Photogrammetry):
             "perspective/yfov perspective/aspectRatio": "lenses",
         },
         refused={"cameras/type=orthographic": "lenses without perspective"},
-        told={"KHR_lights_*": "the light is where the options say"},
+        told={
+            "KHR_lights_*": "the light is where the options say",
+            "animations": "cameras are taken from where they are without it",
+            "EXT_mesh_gpu_instancing": "copies",
+        },
         harmless={
             "perspective/znear perspective/zfar": "the range of depth",
-            "meshes/* materials/* textures/* animations/* skins/* buffers/*": "the scene",
+            "meshes/* materials/* textures/* skins/* buffers/*": "the scene",
+            "KHR_draco_* KHR_mat* KHR_mesh_* KHR_texture_* EXT_mesh* EXT_texture_* KHR_xmp*": "extensions of the scene",
         },
     )
 
@@ -61,7 +66,7 @@ class GltfCameras(Photogrammetry):
             if camera.perspective is None:
                 raise InputError(f"{what}: type: is {str(camera.type)!r}; must be perspective")
             yield Frame(image, lens_of(camera.perspective, image, what), rigid(placed[k], what) @ OPENGL, said=name)
-        self.tell_unused(self.src, (str(name) for name in gltf.extensionsUsed or () if "lights" in str(name)))
+        self.tell_unused(self.src, [*map(str, gltf.extensionsUsed or ()), *["animations"] * bool(gltf.animations)])
 
 
 def read_gltf(path: Path) -> pygltflib.GLTF2:

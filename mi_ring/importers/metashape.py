@@ -171,8 +171,9 @@ def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
     if sensor.get("type", "frame") not in KINDS:  # a panorama has no calibration
         raise InputError(f"{what}: type: is {sensor.get('type')!r}; must be frame or fisheye; leave such "
                          "photographs out")  # fmt: skip
-    if sensor.find("property[@name='rolling_shutter'][@value='true']") is not None:
-        raise InputError(f"{what}: rolling_shutter: is true, which is not supported; align without rolling shutter "
+    shutter = sensor.find("property[@name='rolling_shutter']")
+    if shutter is not None and (state := shutter.get("value", "")).lower() not in ("false", "0", "disabled"):
+        raise InputError(f"{what}: rolling_shutter: is {state}, which is not supported; align without rolling shutter "
                          "compensation")  # fmt: skip
     calibration = sensor.find("calibration[@class='adjusted']")
     if calibration is None:

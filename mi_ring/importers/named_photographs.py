@@ -13,6 +13,7 @@ from mi_ring.importers.frames import Frame, Source
 from mi_ring.importers.photograph_files import MASKS, PhotographFiles, name_of, refuse_twins
 from mi_ring.importers.reading import first_file, has_alpha, images_below
 
+MASK_AFFIX = re.compile(r"^masks?[-_. ]|[-_. ]masks?$", re.IGNORECASE)  #: in the names of masks, without suffix
 MASK_LIKE = re.compile("mask|segment|matte|alpha", re.IGNORECASE)  #: in the names of folders that may hold masks
 
 
@@ -27,8 +28,9 @@ class NamedPhotographs(Source):
     the names of their folders decide.
     Without this option: the places that SRC names, or the nearest folder `images` beside or above SRC."""
     masks: Path | None = None
-    """Folder of masks: photo.jpg has the mask photo.jpg.png, photo.png or photo.jpg.
-    Without this option: the masks that SRC names, alpha channels, or a folder `masks` beside the photographs."""
+    """Folder of masks: photo.jpg has the mask photo.jpg.png, photo.png, photo.jpg or photo_mask.png.
+    Without this option: the masks that SRC names, alpha channels, a folder `masks` beside the photographs, or
+    photo_mask.png among them."""
 
     def posed(self) -> Iterator[Frame]:
         """Yield the photographs that have a pose.
@@ -96,8 +98,8 @@ class NamedPhotographs(Source):
                               f"photographs; not used: {others}")  # fmt: skip
         return best
 
-    def mask_at(self, path: str, what: str) -> Path:
-        """Return the mask file that the camera file calls `path`.
+    def mask_at(self, path: str, image: Path, what: str) -> Path:
+        """Return the mask file of the photograph `image` that the camera file calls `path`.
 
         `path` may be relative to the camera file. Otherwise a file of this name is looked for in and below the folder
         `masks`. Without this option, it is looked for below the folder of the camera file. Raises InputError if there
@@ -106,7 +108,8 @@ class NamedPhotographs(Source):
         if is_file(file := self.beside / path):
             return file
         folder = self.masks or self.beside
-        if found := PhotographFiles(images_below(folder), folder).find(path)[0]:
+        found, agrees = PhotographFiles([f for f in images_below(folder) if f != image], folder).find(path)
+        if found and agrees:
             return found
         raise InputError(f"{what}: no mask {path!r} in {folder}; give --masks, its folder, or take it out of the file")
 
@@ -126,8 +129,8 @@ class NamedPhotographs(Source):
         """Find the masks of all frames, and set `mask` of each frame.
 
         With the option `masks`, they come from this folder. Raises InputError if a photograph has no mask there.
-        Without the option, they come from the alpha channels of the photographs, and then from `masks_beside`. In this
-        case, a photograph may have no mask.
+        Without the option, they come from the alpha channels of the photographs, then from `masks_beside`, and then
+        from files such as photo_mask.png among the photographs. In these cases, a photograph may have no mask.
         """
         folder, root = self.masks, self.photograph_files.root
         if folder is None:
@@ -136,11 +139,17 @@ class NamedPhotographs(Source):
                     frame.mask = frame.image
             if all(frame.mask for frame in frames):  # or none at all
                 return
-            if (folder := self.masks_beside(root, frames[0].image.stem)) is None:
-                return
+            folder = self.masks_beside(root, frames[0].image.stem)
         elif not folder.is_dir():
             raise InputError(f"{folder}: --masks: no such folder")
-        masks = PhotographFiles(images_below(folder), folder)
+        shown = {frame.image for frame in frames}
+        files = [
+            file for file in (images_below(folder) if folder else self.photograph_files.files) if file not in shown
+        ]
+        if folder is None and not (files := [file for file in files if MASK_AFFIX.search(file.stem)]):
+            return
+        folder = folder or root
+        masks = PhotographFiles(files or images_below(folder), folder, MASK_AFFIX)
         wanted = [frame for frame in frames if frame.mask is None or self.masks is not None]
         paths = [f.image.relative_to(root).as_posix() if f.image.is_relative_to(root) else f.image.name for f in wanted]
         found = [masks.find(path) for path in paths]

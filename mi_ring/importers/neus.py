@@ -40,7 +40,10 @@ class Neus(Source):
         cameras = load_npz(path)
         self.tell_unused(path, cameras)
         numbers = sorted(int(key[10:]) for key in cameras if re.fullmatch(r"world_mat_\d+", key))
-        images, array = numbered_images(self.src / "image"), self.src / "images.npy"
+        place = next(
+            (own for name in ("image", "images", "rgb") if (own := self.src / name).is_dir()), self.src / "image"
+        )
+        images, array = numbered_images(place), self.src / "images.npy"
         if array.is_file():
             stack = load_npy(array)
             if stack.ndim != 4 or stack.shape[3] != 3 or len(stack) != len(numbers) or stack.dtype.kind not in "fiu":
@@ -53,7 +56,7 @@ class Neus(Source):
         if not set(images) <= set(numbers):  # the names are not the cameras' numbers: match them by order
             if len(images) != len(numbers):
                 raise InputError(f"{path}: world_mat: there are {len(numbers)}, but {len(images)} photographs in "
-                                 f"{self.src / 'image'}; must be as many")  # fmt: skip
+                                 f"{place}; must be as many")  # fmt: skip
             images = dict(zip(numbers, [images[n] for n in sorted(images)]))
         self.without_photograph.extend(f"world_mat_{k}" for k in numbers if k not in images)
         masks = self.masks(images)

@@ -41,14 +41,15 @@ class PhotographFiles:
     `find` chooses the file whose folders match the path best.
     """
 
-    def __init__(self, files: Iterable[Path], root: Path) -> None:
+    def __init__(self, files: Iterable[Path], root: Path, affix: re.Pattern[str] | None = None) -> None:
+        """`affix`: what names without suffix may have more than those that are looked for, as in photo_mask.png."""
         self.files, self.root = list(files), root
         self.folders = {file: parts_of(file.parent.as_posix()) for file in self.files}
         self.below = len(parts_of(root.as_posix()))  #: number of folders that all files share
         self.by_name: dict[str, list[Path]] = defaultdict(list)
         for file in self.files:
             name = parts_of(file.name)[0]
-            for key in {name, stem_of(name)}:
+            for key in {name, stem := stem_of(name), affix.sub("", stem) if affix else stem}:
                 self.by_name[key].append(file)
 
     @property

@@ -16,6 +16,7 @@ from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading, require_readable
 
 Content = TypeVar("Content")
+Key = TypeVar("Key")
 
 
 def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
@@ -107,10 +108,20 @@ def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
 def numbered_images(folder: Path) -> dict[int, Path]:
     """Return the image files in a folder: a dict from numbers to paths.
 
-    If all file names are numbers, these are the keys. Otherwise the keys are 0, 1, … in the order of the names.
+    If all file names are numbers, these are the keys. Otherwise the keys are 0, 1, … in the order of the names. Raises
+    InputError if two names are the same number.
     """
     files = list_images(folder)
-    return {int(f.stem): f for f in files} if all(f.stem.isdigit() for f in files) else dict(enumerate(files))
+    return by_key(files, lambda f: int(f.stem)) if all(f.stem.isdigit() for f in files) else dict(enumerate(files))
+
+
+def by_key(files: Iterable[Path], key: Callable[[Path], Key]) -> dict[Key, Path]:
+    """Return a dict from `key(file)` to file. Raises InputError if two files have the same key."""
+    found: dict[Key, Path] = {}
+    for file in files:
+        if (other := found.setdefault(key(file), file)) != file:
+            raise InputError(f"{file}: may be the same photograph as {other.name}; keep one of them")
+    return found
 
 
 def chosen(wanted: Collection[int], available: Collection[int], option: str, where: Path) -> list[int]:

@@ -15,7 +15,7 @@ from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens, opencv_lens, pose_of
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import image_size, list_images, load_lines, load_xml, matrix
+from mi_ring.importers.reading import by_key, image_size, list_images, load_lines, load_xml, matrix
 
 XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")  #: columns of a table [scene units, degrees]
@@ -55,6 +55,8 @@ class RealityCapture(Photogrammetry):
     )  # fmt: skip
 
     def posed(self) -> Iterator[Frame]:
+        if self.src.suffix.lower() == ".xmp":
+            raise InputError(f"{self.src}: SRC: is the sidecar of one photograph; give its folder")
         return self.from_sidecars() if self.src.is_dir() else self.from_csv()
 
     def from_sidecars(self) -> Iterator[Frame]:
@@ -63,6 +65,7 @@ class RealityCapture(Photogrammetry):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
         images = list_images(self.images or (self.src if list_images(self.src) else self.folder))
+        by_key([image for image in images if image.stem in sidecars], lambda image: image.stem)
         said: dict[str, None] = {}
         for image in images if self.photographs is None else self.photographs:
             path = sidecars.get(image.stem)
@@ -144,11 +147,11 @@ def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
 
 
 def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Read a CSV file. Returns (column names, rows). A line that begins with #cameras is skipped.
+    """Read a CSV file. Returns (column names, rows). Lines that begin with #cameras or sep= are skipped.
 
     It also accepts what spreadsheet programs write: semicolons or tabs, decimal commas, other encodings than UTF-8.
     """
-    lines = [line for line in load_lines(path, others=True) if not line.startswith("#cameras")]
+    lines = [line for line in load_lines(path, others=True) if not line.startswith(("#cameras", "sep="))]
     separator = max(",;\t", key=lines[0].count) if lines else ","
     try:
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]

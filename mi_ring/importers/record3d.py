@@ -11,16 +11,17 @@ from mi_ring.fields import Fields
 from mi_ring.importers.camera_models import Lens, pose_of, rotation_of
 from mi_ring.importers.frames import OPENGL, Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import list_images, load_json, matrix, require_object
+from mi_ring.importers.reading import by_key, list_images, load_json, matrix, require_object
 
 
 @dataclass(frozen=True)
 class Record3D(Photogrammetry):
     """Record3D: metadata.json beside a folder rgb. The light is fixed to the camera.
 
-    SRC is the folder. The file of a photograph is named by its number, for example rgb/7.jpg. Pose number 7 in
-    metadata.json belongs to it. A pose is a quaternion x y z w and a position, camera-to-world. The camera looks along
-    its -z axis, and its y axis points up. The lens is perFrameIntrinsicCoeffs (fx, fy, cx, cy), or else K (by columns).
+    SRC is metadata.json or its folder. The file of a photograph is named by its number, for example rgb/7.jpg. Pose
+    number 7 in metadata.json belongs to it. A pose is a quaternion x y z w and a position, camera-to-world. The
+    camera looks along its -z axis, and its y axis points up. The lens is perFrameIntrinsicCoeffs (fx, fy, cx, cy),
+    or else K (by columns).
     """
 
     fields = Fields(
@@ -31,12 +32,14 @@ class Record3D(Photogrammetry):
         },
     )  # fmt: skip
 
+    names = ("metadata.json",)
+
     @property
     def folder(self) -> Path:
-        return self.images or self.src / "rgb"
+        return self.images or self.beside / "rgb"
 
     def posed(self) -> Iterator[Frame]:
-        path = self.src / "metadata.json"
+        path = self.cameras
         given = require_object(load_json(path), str(path))
         poses, size = given.get("poses"), matrix([given.get("w"), given.get("h")], (2,), f"{path}: w, h")
         if not isinstance(poses, list) or not poses:
@@ -49,7 +52,8 @@ class Record3D(Photogrammetry):
             if K[2, :2].any() or K[0, 1] or K[1, 0]:
                 raise InputError(f"{path}: K: is {K.T.ravel()}; must be fx 0 0 0 fy 0 cx cy 1, by columns")
             lenses = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(poses), 1))
-        names = {int(file.stem): file.name for file in list_images(self.folder) if file.stem.isdecimal()}
+        files = [file for file in list_images(self.folder) if file.stem.isdecimal()]
+        names = {number: file.name for number, file in by_key(files, lambda file: int(file.stem)).items()}
         for k, (own, params) in enumerate(zip(poses, lenses)):
             what = f"{path}: poses[{k}]"
             numbers = matrix(own, (7,), what)

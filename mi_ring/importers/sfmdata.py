@@ -70,6 +70,9 @@ class SfmData(Photogrammetry):
     )  # fmt: skip
 
     def posed(self) -> Iterator[Frame]:
+        if self.src.suffix.lower() == ".abc":
+            raise InputError(f"{self.src}: SRC: is an Alembic file, which is not read; convert it to .sfm by "
+                             "Meshroom's node ConvertSfMFormat")  # fmt: skip
         top = load_json(self.src)
         if not isinstance(top, dict) or not isinstance(top.get("views"), list):
             raise InputError(f"{self.src}: views: is missing; must be a scene of Meshroom or OpenMVG")
@@ -141,7 +144,10 @@ class SfmData(Photogrammetry):
         values = top.get(name) or []
         if not isinstance(values, list):
             raise InputError(f"{self.src}: {name}: must be a list")
-        return {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
+        found = {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
+        if len(found) < len(values):
+            raise InputError(f"{self.src}: {name}: some have the same {key}; must be different")
+        return found
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[Frame]:
         """Yield one frame, that of the photograph `file`. Yields nothing if no image file is found for it."""

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -61,6 +61,11 @@ class Transforms(NamedPhotographs):
     )
 
     names = "transforms.json", "transforms_train.json"
+    #: Fields that give the focal lengths, by kind. A frame's own kind replaces another kind of the whole file.
+    focal: ClassVar = (
+        {"fl_x", "fl_y"}, {"camera_angle_x", "camera_angle_y", "x_fov", "y_fov"}, {"camera_intrinsics"},
+        {"intrinsic_matrix"},
+    )  # fmt: skip
 
     @property
     def folder(self) -> Path:
@@ -72,6 +77,8 @@ class Transforms(NamedPhotographs):
         frames = top.get("frames") if isinstance(top, dict) else None
         if not isinstance(frames, list) or not frames:
             raise InputError(f"{path}: frames: found none; must be a list of photographs")
+        if others := [file.name for file in sorted(path.parent.glob("transforms*.json")) if file.name != path.name]:
+            self.notes.append(f"{path.parent}: not used: {', '.join(others[:9])}; convert each to a scene of its own")
         said: dict[str, None] = {}
         for number, own in enumerate(frames):
             where = f"frames[{number}]"
@@ -82,7 +89,9 @@ class Transforms(NamedPhotographs):
                 raise InputError(f"{path}: {where}.file_path: missing; must be the name of an image file")
             if (image := self.photograph(name, f"{path}: {where}.file_path", relative=True)) is None:
                 continue
-            fields = {key: value for key, value in top.items() if key != "frames"} | own
+            replaced = set().union(*self.focal) if any(kind & {*own} for kind in self.focal) else set()
+            replaced -= set().union(*(kind for kind in self.focal if kind & {*own}))
+            fields = {key: value for key, value in top.items() if key not in {"frames", *replaced}} | own
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix")
             if not fields.get("from_na"):  # NeuS2's sign of OpenCV's axes
                 pose = pose @ OPENGL
@@ -91,7 +100,7 @@ class Transforms(NamedPhotographs):
             mask = fields.get("mask_path")
             frame = Frame(image, camera, pose, said=name)
             if mask is not None:
-                frame.mask = self.mask_at(str(mask), f"{path}: {where}.mask_path")
+                frame.mask = self.mask_at(str(mask), image, f"{path}: {where}.mask_path")
             intensity = np.ones(3)
             if (rgb := fields.get("pl_intensity")) is not None:
                 rgb = [rgb] * 3 if isinstance(rgb, int | float) else rgb

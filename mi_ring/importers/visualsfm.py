@@ -52,6 +52,9 @@ class VisualSfm(Photogrammetry):
             name = name.replace('"', " ")
             what = f"{self.src}: camera {name[:99]!r}"
             f, *quaternion, x, y, z, r, _ = matrix(values, (10,), what)
+            if len(fixed) > 5 and matrix(fixed[5], (), f"{self.src}: FixedK: r") not in (0, r):
+                raise InputError(f"{what}: radial distortion: is {r:g}, but that of FixedK is {fixed[5]}; undistort "
+                                 "the photographs in VisualSFM")  # fmt: skip
             R = rotation_of(np.roll(quaternion, -1), f"{what}: quaternion")
             if not f:
                 self.without_pose.add(name)

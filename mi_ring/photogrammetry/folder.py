@@ -15,6 +15,7 @@ from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.image_headers import HEIF, KINDS, RAW, SUFFIXES, encoding_of, exif_of, open_image
 from mi_ring.images import linear_to_srgb, mask_values, orientation_axes, oriented, read_image, srgb_to_linear
+from mi_ring.importers.named_photographs import MASK_AFFIX
 from mi_ring.importers.photogrammetry import exposures_of
 from mi_ring.importers.reading import image_size, read_as
 from mi_ring.scene.shot import Encoding
@@ -187,12 +188,13 @@ class Picture:
         return (mask // (np.iinfo(mask.dtype).max // 255)).astype(np.uint8)
 
     def mask_file(self, folder: Path) -> Path | None:
-        """Return the mask file of this photograph in `folder`. For photo.jpg, it is photo.jpg.png or photo.png.
+        """Return the mask file of this photograph in `folder`. Returns None if there is no such file.
 
-        Other image formats are possible, too. Returns None if there is no such file.
+        For photo.jpg, it is photo.jpg.png, photo.png, photo_mask.png or mask_photo.png, or in another image format.
         """
         suffixes = [own for suffix in (".png", *SUFFIXES) for own in (suffix, suffix.upper())]
-        files = (folder / f"{name}{suffix}" for name in (self.path.name, self.name) for suffix in suffixes)
+        names = self.path.name, self.name, f"{self.name}_mask", f"mask_{self.name}"
+        files = (folder / f"{name}{suffix}" for name in names for suffix in suffixes)
         return next((file for file in files if file.is_file()), None)
 
     def close(self) -> None:
@@ -242,8 +244,14 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
         command.require_utf8(str(path))
         if "$" in path.name:
             raise InputError(f"{path}: FOLDER: has a $ in its name, which scene files take for a parameter; rename it")
+        if path.stem in found and not {kind, found[path.stem].suffix.lower()} & {*RAW, *HEIF}:
+            raise InputError(f"{path}: FOLDER: has the name of {found[path.stem].name}; keep one of them, or move "
+                             "masks to a folder of their own, and give it by --masks")  # fmt: skip
         if path.stem not in found or kind in RAW:  # a raw file is linear: prefer it to a JPEG of the same name
             found[path.stem] = path
+    if mask := next((name for name in found if MASK_AFFIX.search(name) and MASK_AFFIX.sub("", name) in found), None):
+        raise InputError(f"{found[mask]}: FOLDER: looks like the mask of {found[MASK_AFFIX.sub('', mask)].name}; move "
+                         "masks to a folder of their own, and give it by --masks")  # fmt: skip
     if len(found) < MIN_PHOTOGRAPHS:
         kinds = Counter(path.suffix.lower() for path in folder.iterdir() if path.suffix and path.is_file())
         others = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4) if kind not in SUFFIXES)
