@@ -118,9 +118,11 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def require_whole(path: Path) -> None:
     """Raise ValueError if a JPEG file ends before its pixels do. Pixels are not decoded."""
-    content, place = path.read_bytes() if path.suffix.lower() in BY_KIND["JPEG"] else b"", 2
-    while content[place : place + 1] == b"\xff" != content[place + 1 : place + 2] != b"\xda":  # before the first scan
-        place += 2 + int.from_bytes(content[place + 2 : place + 4], "big")
+    if path.suffix.lower() not in BY_KIND["JPEG"]:
+        return
+    content, place = path.read_bytes(), 2
+    while content[place : place + 1] == b"\xff" and content[place + 1 : place + 2] not in (b"\xff", b"\xda"):
+        place += 2 + int.from_bytes(content[place + 2 : place + 4], "big")  # to the first scan: previews end, too
     if content.startswith(b"\xff\xd8") and b"\xff\xd9" not in content[place:]:
         raise ValueError("is cut off in its pixels; copy it again")
 

@@ -164,9 +164,9 @@ def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
 def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
     """Raise InputError if the XML is invalid, or if a photograph or its light has no place.
 
-    Without a place, Mitsuba would use the origin. It would ignore the last row of a matrix. Files that the scene
-    includes are checked, too; `above`: the files that include this one. Raises UnicodeDecodeError if the file is not
-    UTF-8.
+    Without a place, Mitsuba would use the origin. It ignores the last row of a matrix: this row must be 0 0 0 1. Files
+    that the scene includes are checked, too. `above`: the files that include this one. Raises UnicodeDecodeError if the
+    file is not UTF-8.
     """
     content = path.read_bytes()
     content.decode("utf-8")
@@ -196,7 +196,7 @@ def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
 
 
 def is_affine(row: Sequence[str]) -> bool:
-    """Return whether the last `row` of a matrix is 0 0 0 1. It is also true if these are no numbers."""
+    """Return whether the last `row` of a matrix is 0 0 0 1. Also returns True if a word of it is no number."""
     try:
         return bool(np.allclose([float(word) for word in row], [0, 0, 0, 1]))
     except ValueError:  # parameters, and words that Mitsuba refuses

@@ -142,14 +142,13 @@ class NamedPhotographs(Source):
             folder = self.masks_beside(root, frames[0].image.stem)
         elif not folder.is_dir():
             raise InputError(f"{folder}: --masks: no such folder")
-        shown = {frame.image for frame in frames}
-        files = [
-            file for file in (images_below(folder) if folder else self.photograph_files.files) if file not in shown
-        ]
-        if folder is None and not (files := [file for file in files if MASK_AFFIX.search(file.stem)]):
+        among = [file for file in self.photograph_files.files if MASK_AFFIX.search(file.stem)]
+        listed, shown = images_below(folder) if folder else among, {frame.image for frame in frames}
+        files = [file for file in listed if file not in shown]
+        if folder is None and not files:
             return
         folder = folder or root
-        masks = PhotographFiles(files or images_below(folder), folder, MASK_AFFIX)
+        masks = PhotographFiles(files or listed, folder, MASK_AFFIX)
         wanted = [frame for frame in frames if frame.mask is None or self.masks is not None]
         paths = [f.image.relative_to(root).as_posix() if f.image.is_relative_to(root) else f.image.name for f in wanted]
         found = [masks.find(path) for path in paths]

@@ -146,7 +146,7 @@ class SfmData(Photogrammetry):
             raise InputError(f"{self.src}: {name}: must be a list")
         found = {str(require_object(value, f"{self.src}: {name}").get(key)): value for value in values}
         if len(found) < len(values):
-            raise InputError(f"{self.src}: {name}: some have the same {key}; must be different")
+            raise InputError(f"{self.src}: {name}: two entries have the same {key}; each needs its own")
         return found
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[Frame]:

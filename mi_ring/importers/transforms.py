@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +14,13 @@ from mi_ring.importers.camera_models import Lens, opencv_lens, pinhole_lens
 from mi_ring.importers.frames import OPENGL, Frame, Light
 from mi_ring.importers.named_photographs import NamedPhotographs
 from mi_ring.importers.reading import image_size, images_below, load_json, matrix
+
+#: Fields that give focal lengths, by kind. If a frame has fields of one kind, those of the whole file of other kinds do
+#: not apply to it.
+FOCAL = (
+    {"fl_x", "fl_y"}, {"camera_angle_x", "camera_angle_y", "x_fov", "y_fov"}, {"camera_intrinsics"},
+    {"intrinsic_matrix"},
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,11 +68,6 @@ class Transforms(NamedPhotographs):
     )
 
     names = "transforms.json", "transforms_train.json"
-    #: Fields that give the focal lengths, by kind. A frame's own kind replaces another kind of the whole file.
-    focal: ClassVar = (
-        {"fl_x", "fl_y"}, {"camera_angle_x", "camera_angle_y", "x_fov", "y_fov"}, {"camera_intrinsics"},
-        {"intrinsic_matrix"},
-    )  # fmt: skip
 
     @property
     def folder(self) -> Path:
@@ -89,8 +91,8 @@ class Transforms(NamedPhotographs):
                 raise InputError(f"{path}: {where}.file_path: missing; must be the name of an image file")
             if (image := self.photograph(name, f"{path}: {where}.file_path", relative=True)) is None:
                 continue
-            replaced = set().union(*self.focal) if any(kind & {*own} for kind in self.focal) else set()
-            replaced -= set().union(*(kind for kind in self.focal if kind & {*own}))
+            given = set().union(*(kind for kind in FOCAL if kind & own.keys()))
+            replaced = set().union(*FOCAL) - given if given else set()
             fields = {key: value for key, value in top.items() if key not in {"frames", *replaced}} | own
             pose = matrix(own.get("transform_matrix"), (4, 4), f"{path}: {where}.transform_matrix")
             if not fields.get("from_na"):  # NeuS2's sign of OpenCV's axes
