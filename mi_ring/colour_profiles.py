@@ -18,7 +18,7 @@ class Statement(NamedTuple):
     """
 
     profile: bytes | None = None  #: an ICC profile
-    exponent: float | None = None  #: linear = encoded ^ exponent; 2.2 stands for sRGB's curve
+    exponent: float | None = None  #: linear = encoded ^ exponent; 2.2 means the exact curve of sRGB
 
 
 def srgb_to_linear(v: np.ndarray) -> np.ndarray:
@@ -30,7 +30,7 @@ def primaries_profile(white: tuple, primaries: tuple, exponent: float = 1.0) -> 
     """Make the ICC profile of an RGB colour space. Returns its bytes.
 
     `white`: chromaticity (x, y) of white. `primaries`: x, y of red, of green and of blue, six numbers. `exponent`:
-    linear value = encoded value ^ exponent; 2.2 stands for sRGB's curve.
+    linear value = encoded value ^ exponent. An exponent of 2.2 gives the exact curve of sRGB instead.
     """
     places = [value for k in range(3) for value in (*primaries[2 * k : 2 * k + 2], 1.0)]
     curve: dict[str, Any] = {"gamma": exponent}

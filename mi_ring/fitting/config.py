@@ -66,9 +66,10 @@ class Common:
     ambient: light of the room, from all sides.
     masks: outlines of the object. The fit finds new masks after one half and three quarters of its iterations."""
     masks: Literal["auto", "given", "none"] = "auto"
-    """The masks that the fit uses. Set none if the masks of the scene file are wrong and the background is dark.
+    """The masks that the fit uses. Set none if the masks of the scene file are wrong and the room is dark.
     given: the masks of the scene file.
-    none: the fit ignores these masks. If the room is dark, it makes its own: the bright pixels. Otherwise it has none.
+    none: the fit ignores these masks. In a dark room the bright pixels of each photograph become its mask.
+    In a lit room the fit then uses no mask. The fit measures in the photographs whether the room is dark.
     auto: given if the scene file has masks, otherwise none. To use no mask in any case, set --weights.mask 0."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
     """The start surface that the fit deforms. The fitted surface has the same number of handles (genus).
@@ -138,8 +139,8 @@ class Tuning:
     """Learning rate of Muon at the start. Muon trains the hidden layers of the networks. --optimizer adam has no Muon.
     Raise it for faster progress. Lower it if the loss does not fall steadily."""
     decay: float = 0.1
-    """During the fit, the learning rates fall to this share of their first values, above 0. 1: they stay constant.
-    With a smaller share the surface changes less at the end. The learning rates of cameras fall to one half instead."""
+    """Learning rates at the end of the fit, as a share of those at its start. With 1 they stay constant.
+    With a smaller share the surface changes less at the end. The learning rates of cameras always fall to one half."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
     """Number format of matrix products. auto: bfloat16 if it is faster than float32 on this machine.
     Set float32 to compare results of different machines. A fit in float32 may take longer."""
