@@ -267,7 +267,7 @@ def encodings(paths: Sequence[Path]) -> list[str]:
 
 
 def encoding_of(path: Path) -> Literal["srgb", "linear"]:
-    """Return how pixels are encoded after the colour space that their file declares has been applied: "srgb" or "linear"."""
+    """Return "srgb" or "linear", the encoding of a file's pixels after its declared colour space has been applied."""
     said = statement_of(path)
     sample = np.zeros((1, 1, 3), np.uint8)
     return "srgb" if bits_of(path) == 8 and as_stated(sample, said).dtype == np.uint8 else "linear"
