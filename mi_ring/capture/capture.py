@@ -194,31 +194,25 @@ class Capture:
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Split the photographs `index` into groups of one image size, each of at most `most`. Yields their indices."""
+        """Split the photographs `index` into groups of one size, each of at most `most`. Yields their indices."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
                 yield chosen[start : start + most]
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
-        """Return camera and lights of photograph `k` for the renderer.
-
-        `scale`: divides width and height of the picture.
-        """
+        """Return camera and lights of photograph `k`, for rendering. Width and height are divided by `scale`."""
         return self.selected([k], scale)
 
     def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
-        """Return cameras and lights of the photographs `index` for the renderer. The photographs must be of one size.
+        """Return cameras and lights of the photographs `index`, all of one size, for rendering.
 
-        `scale`: divides width and height of the pictures.
+        Width and height are divided by `scale`.
         """
         return self.photographs.select(index, self.shots[index[0]].size, scale)
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
-        """Read the pixels of the photographs `index`, all of one size.
-
-        Blocks of `scale` × `scale` pixels are averaged.
-        """
+        """Read the photographs `index`, all of one size, and average blocks of `scale` × `scale` pixels."""
         return Observation.joined([self._observed.get(k, scale, partial(self._observe, k, scale)) for k in index])
 
     def _observe(self, k: int, scale: int) -> Observation:
@@ -263,7 +257,7 @@ class Capture:
 
     @property
     def up(self) -> np.ndarray:
-        """Mean up direction (3,) of the cameras, of length 1; the first camera's up direction if the mean is near 0."""
+        """Mean up direction (3,) of the cameras, of length 1; that of the first camera if the mean is near 0."""
         ups = np.stack([shot.camera.up for shot in self.shots])
         up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
         return up / np.linalg.norm(up)
@@ -316,7 +310,7 @@ class Capture:
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
-        """Return (centre (3,), radius) [scene units] of the normalising sphere, from the scene file or else estimated."""
+        """Return (centre (3,), radius) [scene units] of the normalising sphere: given by the file, or else estimated."""
         center, radius = self.shape.center, self.shape.radius
         if center is None or radius is None:
             if self.hull:
