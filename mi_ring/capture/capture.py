@@ -310,7 +310,7 @@ class Capture:
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
-        """Return (centre (3,), radius) [scene units] of the normalising sphere: given by the file, or else estimated."""
+        """Return (centre (3,), radius) [scene units] of the normalising sphere: given by the file or else estimated."""
         center, radius = self.shape.center, self.shape.radius
         if center is None or radius is None:
             if self.hull:
