@@ -82,9 +82,10 @@ class Iteration(renamed.Renamed):
 
     @torch.no_grad()
     def unexplained(self) -> float:
-        """Return the sum of absolute errors on the object, divided by the sum of observed radiance on the object.
+        """Return the share of the observed light that the prediction does not explain.
 
-        It is NaN if the observed radiance is 0.
+        It is the sum of absolute errors, divided by the sum of observed radiance, over pixels that show only the
+        object. It is NaN if the observed radiance is 0.
         """
         pixels = self.object_pixels()
         error = (self.prediction.rgb - self.observation.rgb)[pixels]

@@ -51,7 +51,7 @@ def rgb_loss(
 def mask_loss(
     coverage: Tensor, mask: Tensor, sigma: float, valid: Tensor | None = None, doubt: float = math.inf
 ) -> Tensor:
-    """Compute the mean squared difference of coverage (n, H, W) and mask (n, H, W), after a blur.
+    """Compute the mean squared difference of coverage (n, H, W) and mask (n, H, W), both in [0, 1], after a blur.
 
     `sigma`: standard deviation of the Gaussian blur [px]. Because of the blur, an outline that does not touch the mask
     has a gradient. `valid` (n, H, W): pixels that are compared; None: all. `doubt`: differences above it have a limited

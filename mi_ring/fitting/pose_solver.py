@@ -41,13 +41,13 @@ def slopes(picture: Tensor) -> Tensor:
 
 
 def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: float) -> Tensor:
-    """Compute how points of a sphere move in the picture if the camera moves: a Jacobian (H, W, 2, 6) per pixel.
+    """Compute how points of a sphere move in the picture if the camera moves. Returns a Jacobian (H, W, 2, 6).
 
     The two rows are the motion to the right and downward [px]. The six columns are the rotation [rad] about each of the
-    camera's axes and the translation [scene units] along each of them (Mitsuba's axes). `intrinsics` (4,): fx, fy, cx,
-    cy [px], without distortion. `size`: (width, height) of the picture [px]. `center` (3,), `radius`: the sphere, in
-    camera coordinates; it is made smaller if the camera is inside. The point of a ray that misses the sphere is the
-    point of the ray that is nearest to the sphere.
+    camera's axes and the translation [scene units] along each of them (x left, y up, z forward). `intrinsics` (4,): fx,
+    fy, cx, cy [px], without distortion. `size`: (width, height) of the picture [px]. `center` (3,), `radius`: the
+    sphere, in camera coordinates; it is made smaller if the camera is inside. If the ray of a pixel misses the sphere,
+    the point of the ray nearest to the sphere is used.
     """
     width, height = size
     fx, fy, cx, cy = intrinsics

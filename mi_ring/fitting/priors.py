@@ -94,5 +94,5 @@ def albedo_variation(it: Iteration) -> Tensor:
 
 
 def material_rank(it: Iteration) -> Tensor:
-    """Compute the term `material_rank`: a smooth measure of the number of basis materials; see `number_of_bases`."""
+    """Compute the term `material_rank`: about how many basis materials the material is a sum of, as a smooth number."""
     return number_of_bases(columns_of(it.prediction.material, it.context.model.ring.brdf_net))

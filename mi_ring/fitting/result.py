@@ -61,9 +61,9 @@ def result_of(
 
 
 def room_of(problem: Problem, refined: Capture) -> np.ndarray | None:
-    """Return the room light (BASIS, 3) that the fit has found: that of `refined` minus the scene's own environment.
+    """Return the room light that the fit has found, as spherical harmonics (BASIS, 3); None if there is no such light.
 
-    `refined`: the calibrated capture. Returns None if there is no such light.
+    `refined`: the calibrated capture. The light of the scene's own environment map is subtracted.
     """
     room = refined.room
     if room is None or problem.environment is None:

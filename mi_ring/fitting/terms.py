@@ -20,7 +20,7 @@ REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iter
 
 
 class Term(NamedTuple):
-    """A term of the loss: a function, its weight, and a factor of the weight that changes during the fit."""
+    """A term of the loss: a function of an `Iteration`, a weight, and a factor of the weight that changes in the fit."""
 
     function: Callable[[Iteration], Tensor | None]  #: its value, a scalar; None: it does not apply this time
     weight: float = 1.0  #: used if `Config.weights` has none of its name; 0 switches the term off
@@ -132,7 +132,10 @@ class Loss:
             raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
 
     def weight(self, name: str) -> float:
-        """Return the weight of the term `name` before scheduling; 0 if there is no such term."""
+        """Return the weight of the term `name`; 0 if there is no such term.
+
+        The factor that changes during the fit is not included.
+        """
         return self.weights.get(name, self.terms[name].weight) if name in self.terms else 0.0
 
     def require_velocity(self, shape_net: Flow) -> None:
