@@ -78,7 +78,7 @@ def table2(options: ExperimentOptions) -> list[Run]:
 
 
 def table3(options: ExperimentOptions) -> list[Run]:
-    """List three runs for each dataset and seed: with exact cameras, with wrong cameras, and with wrong ones to refine."""
+    """List three runs for each dataset and seed: exact cameras, wrong cameras, and wrong ones that the fit refines."""
     runs = []
     for exact in datasets(options):
         for seed in options.seeds:
