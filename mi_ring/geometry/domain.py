@@ -53,7 +53,7 @@ def normalized(vectors: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def samplings(kind: str, points: bytes, faces: bytes) -> tuple[dict, dict]:
-    """Return two dicts that all domains of one surface share: meshes by level, and random points of the surface by level.
+    """Return two dicts that all domains of one surface share: meshes by level, and random surface points by level.
 
     They are empty at first. `kind`, `points`, `faces`: type and mesh of the domain, as a key. They are shared because
     it takes seconds to remesh a surface.
@@ -123,7 +123,7 @@ class Domain:
         return points, faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """Return new positions (V, 3) for the vertices of a level's mesh: random points of the surface near the old ones.
+        """Return new positions (V, 3) for the vertices of a level's mesh: random surface points near the old positions.
 
         `points` (V, 3): the old positions.
         """
