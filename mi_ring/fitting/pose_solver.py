@@ -32,7 +32,7 @@ NEAR, FAR = 0.2, 0.4  #: progress at which steps begin, for a start near the obj
 def slopes(picture: Tensor) -> Tensor:
     """Compute the image gradient of a picture (H, W, C) by central differences.
 
-    Returns (H, W, C, 2): derivatives to the right and downward.
+    Returns (H, W, C, 2): derivatives to the right and downward, per pixel.
     """
     padded = F.pad(picture.movedim(-1, 0), (1, 1, 1, 1), mode="replicate")
     right = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
@@ -90,7 +90,7 @@ class PoseSolver(torch.optim.Optimizer):
         self.seen: tuple[Tensor, Tensor] | None = None  #: photographs and their curvature
 
     def look(self, it: Iteration) -> None:
-        """Store the photographs of an iteration and the Gauss-Newton Hessian of its loss, for `step`."""
+        """Store the indices of an iteration's photographs and the Gauss-Newton Hessians of its loss, for `step`."""
         self.seen = None
         if it.progress >= self.rate.start:
             self.seen = torch.from_numpy(it.batch.all_photographs), it.batch.share.gathered(curvature(it))
@@ -114,11 +114,11 @@ class PoseSolver(torch.optim.Optimizer):
 
 @torch.no_grad()
 def curvature(it: Iteration) -> Tensor:
-    """Compute the Gauss-Newton Hessian (n, 6, 6) of an iteration's loss with respect to each photograph's pose.
+    """Compute the Gauss-Newton Hessian (n, 6, 6) of an iteration's loss with respect to the pose of each photograph.
 
-    The pose is (`turn`, `move`) [standard deviations of the priors]. The Hessian contains colours, silhouettes and
-    prior. It approximates the surface by a sphere. Absolute differences are treated by iteratively reweighted least
-    squares; those below the mean get the weight of the mean.
+    The pose is three rotations and three translations [standard deviations of their priors]. The Hessian contains
+    colours, silhouettes and prior. It approximates the surface by a sphere. Absolute differences are treated by
+    iteratively reweighted least squares; those below the mean get the weight of the mean.
     """
     context, seen, prediction = it.context, it.observation, it.prediction
     calibration, (n, height, width) = context.model.calibration, prediction.coverage.shape

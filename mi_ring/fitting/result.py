@@ -24,10 +24,10 @@ def result_of(
     problem: Problem, model: Model, renderer: Renderer, schedule: Schedule, course: Course, capture: Capture,
     terms: Sequence[str], unexplained: float,
 ) -> FitResult:  # fmt: skip
-    """Collect the results of a fit for the functions that write them. Writes no files.
+    """Collect the results of a fit, from which files are written later. Writes no files, but evaluates the surface.
 
-    `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: running mean of
-    `Iteration.unexplained`.
+    `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: share of the
+    observed light that recent predictions do not explain.
     """
     calibration, ring, refined = model.calibration, model.ring, model.calibrated(capture)
 
