@@ -14,9 +14,8 @@ RELATIVE = 1  #: rendering intent: relative colorimetric
 class Statement(NamedTuple):
     """The colour space that an image file declares: an ICC `profile` (bytes), or the `exponent` of its tone curve.
 
-    The tone curve is: linear value = encoded value ^ exponent. The exponent 2.2 means the sRGB curve itself, which is
-    near that power. Both fields are None if the file declares nothing: 8-bit pixels are then sRGB, all others are
-    linear.
+    The tone curve is: linear value = encoded value ^ exponent. The exponent 2.2 means the exact curve of sRGB instead.
+    Both fields are None if the file declares nothing: 8-bit pixels are then sRGB, all others are linear.
     """
 
     profile: bytes | None = None  #: an ICC profile
@@ -32,7 +31,7 @@ def primaries_profile(white: tuple, primaries: tuple, exponent: float = 1.0) -> 
     """Make the ICC profile of an RGB colour space. Returns its bytes.
 
     `white`: chromaticity (x, y) of white. `primaries`: x, y of red, of green and of blue, six numbers. `exponent`:
-    linear value = encoded value ^ exponent. For exactly 2.2, the profile contains the sRGB curve instead of this power.
+    linear value = encoded value ^ exponent. An exponent of 2.2 gives the exact curve of sRGB instead.
     """
     places = [value for k in range(3) for value in (*primaries[2 * k : 2 * k + 2], 1.0)]
     curve: dict[str, Any] = {"gamma": exponent}

@@ -230,7 +230,7 @@ def png_statement(info: dict, bits: int) -> Statement:
 
 
 def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield (name, content) of each chunk of a PNG file that precedes the pixels, at most 64 bytes of the content."""
+    """Yield (name, content) of each chunk of a PNG file before the pixels. Content after 64 bytes is left out."""
     with path.open("rb") as file:
         file.seek(8)
         while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":

@@ -138,7 +138,7 @@ def read_tiff(path: Path) -> np.ndarray:
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """Read the picture in an OpenEXR file: (H, W, C) float32. C are R, G, B and A, or Y and A, or the only channel.
+    """Read the picture in an OpenEXR file: (H, W, C) float32. The channels are R, G, B, A, or Y, A, or the only one.
 
     Raises ValueError if no channels form a picture, if the file has several parts or layers or only a part of the
     picture, and for an implausible size.

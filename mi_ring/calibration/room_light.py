@@ -56,10 +56,11 @@ class RoomLight(nn.Module):
     ) -> None:  # fmt: skip
         """Add photographs to the normal equations, solve them, and set the harmonics to the solution.
 
-        `around`: rendered pictures of the light of each single harmonic. `predicted`, `observed` (N, H, W, 3): linear
-        radiance. `predicted` must contain the current room light without occlusion. `counted` (N, H, W) bool: True
-        where a pixel shows only the object. `progress` of the fit, 0 to 1: a room without other light has its finest
-        harmonics only later in the fit. `total`: returns the sum of a tensor over all processes; default: one process.
+        `around`: rendered pictures, one for the light of each spherical harmonic. `predicted`, `observed` (N, H, W, 3):
+        linear radiance. `predicted` must contain the current room light without occlusion. `counted` (N, H, W) bool:
+        True where a pixel shows only the object. `progress` of the fit, 0 to 1: a room without other light has its
+        finest harmonics only later in the fit. `total`: returns the sum of a tensor over all processes; default: one
+        process.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:

@@ -46,7 +46,7 @@ class Found(NamedTuple):
 class Unknown(ABC):
     """Base class of the unknowns of calibration.
 
-    An unknown has `components` numbers for each photograph, lens, light or lamp, or for the capture, as `per` says.
+    It has `components` numbers per photograph, lens, light or lamp, or for the whole capture; `per` says which.
     """
 
     name: str
@@ -122,7 +122,7 @@ class Turn(Unknown):
 
 
 class Move(Unknown):
-    """Translation of each camera along its own axes [median distance from the cameras to the object]."""
+    """Translation of each camera along its own axes. The unit is the median distance from cameras to object."""
 
     solved = True
 

@@ -111,9 +111,10 @@ def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], wid
 
 
 def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
-    """Return for each mask the lowest and highest corner (2, 2) of the object: (column, row) [px]. No mask: None.
+    """Return the lowest and the highest corner (2, 2) of the object in each mask: (column, row) [px].
 
-    An empty mask gives None, too. `large`: True keeps the corners in the cache folder, because masks take long to read.
+    A missing or empty mask gives None. `large`: True keeps the corners in the cache folder, because masks take long to
+    read.
     """
     several = {reader: k for k, reader in enumerate(capture.masks.readers) if reader}  # some may share a mask
 

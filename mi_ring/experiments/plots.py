@@ -49,7 +49,7 @@ def of_finished(plot: Plot) -> Plot:
 
 
 def bars(*columns: tuple[str, str]) -> Plot:
-    """Return a function that draws a bar chart for each of the `columns`, (name, heading) of columns of the table.
+    """Return a function that draws a bar chart for each of the `columns`, given as (name in the table, heading).
 
     Each run has one bar. If a run has no number, the chart shows a word instead, such as "failed".
     """
@@ -71,9 +71,10 @@ def bars(*columns: tuple[str, str]) -> Plot:
 
 
 def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) -> Plot:
-    """Return a function that draws column `y` over column `x`. Each is (name, heading) of a column of the table.
+    """Return a function that draws one column of the table over another.
 
-    Runs that differ only in x are one curve. `logarithmic`: the x axis is logarithmic.
+    `x`, `y`: (name in the table, heading) of both. Runs that differ only in x are one curve. `logarithmic`: the x axis
+    is logarithmic.
     """
 
     @of_finished

@@ -97,7 +97,10 @@ class PoseSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Change the poses of the stored photographs by a Gauss-Newton step. Does nothing before refinement begins."""
+        """Change the poses of the photographs that `look` has stored, by a Gauss-Newton step.
+
+        Does nothing before refinement begins.
+        """
         (group,) = self.param_groups
         turn, move = group["params"]
         if self.seen is None or turn.grad is None:

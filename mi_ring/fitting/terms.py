@@ -20,7 +20,10 @@ REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iter
 
 
 class Term(NamedTuple):
-    """A term of the loss: a function of an iteration, its weight, and a factor of the weight that changes with time."""
+    """A term of the loss: a function of an iteration, and a weight.
+
+    `schedule`: a factor of the weight, which changes during the fit; None: 1.
+    """
 
     function: Callable[[Iteration], Tensor | None]  #: its value, a scalar; None: it does not apply this time
     weight: float = 1.0  #: used if `Config.weights` has none of its name; 0 switches the term off

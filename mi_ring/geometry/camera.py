@@ -110,9 +110,9 @@ class Camera(NamedTuple):
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
     def undistorted(self, places: np.ndarray) -> np.ndarray:
-        """Remove lens distortion from vectors from the principal point, `places` (..., 2) [focal lengths].
+        """Remove lens distortion from points in the picture. Returns (..., 2) in the same unit.
 
-        Returns (..., 2).
+        `places` (..., 2): vectors from the principal point to the points [focal lengths].
         """
         if not self.distortion:
             return places
@@ -149,9 +149,9 @@ class Camera(NamedTuple):
         return tuple(np.asarray(part).tobytes() for part in self)
 
     def fault(self) -> str | None:
-        """Describe what is wrong with principal point, distortion or pose, with the names of fields in scene files.
+        """Describe as text what is wrong with principal point, distortion or pose. Returns None if nothing is wrong.
 
-        Returns None if nothing is wrong.
+        The text uses the names of fields in scene files.
         """
         if (far := np.abs(self.centre / np.array(self.size))).max() > FARTHEST:
             k = int(far.argmax())

@@ -83,8 +83,8 @@ class Hull:
     """The visual hull of silhouettes. Raises InputError if a silhouette is empty.
 
     `center` (3,) and `reach` are the centre and the radius of a ball that contains the hull [scene units]. `outliers`:
-    share of the silhouettes outside which a point of the hull may be; so a few wrong masks do no harm. `what`: name of
-    the capture, at the beginning of error messages.
+    a point may be outside this share of the silhouettes and still belong to the hull, so that a few wrong masks do no
+    harm. `what`: name of the capture, at the beginning of error messages.
     """
 
     def __init__(self, silhouettes: Sequence[Silhouette], what: str, outliers: float = 0.02) -> None:

@@ -74,9 +74,10 @@ class FittedObject(nn.Module):
         return self.brdf_net(s)
 
     def forward(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
-        """Compute (surface points (V, 3) [scene units], dict of BSDF parameters) at the domain points `s` (V, 3).
+        """Compute surface and material at the domain points `s` (V, 3).
 
-        `time`: state of the deformation. 0: the domain. 1: the finished object.
+        Returns (points (V, 3) [scene units], dict from names of BSDF parameters to tensors (V, 3) or (V,)). `time`:
+        state of the deformation. 0: the domain. 1: the finished object.
         """
         return self.surface(s, time), self.material(s)
 
