@@ -36,7 +36,7 @@ LIT = 0.01  #: a room is lit if the background is brighter than this [brightness
 
 
 def require_variant(what: str | Path) -> None:
-    """Raise InputError if the current Mitsuba variant cannot be used for fits. The message begins with `what`."""
+    """Raise InputError unless Mitsuba's variant is llvm_ad_rgb or cuda_ad_rgb. The message begins with `what`."""
     if mi.variant() not in ("llvm_ad_rgb", "cuda_ad_rgb"):
         why = llvm.missing() or "call mi.set_variant('llvm_ad_rgb') first"
         raise InputError(f"{what}: needs the variant llvm_ad_rgb or cuda_ad_rgb of Mitsuba, not {mi.variant()}; {why}")

@@ -137,7 +137,7 @@ def require_scene(path: Path) -> None:
 
 
 def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
-    """Load a scene file. Returns (scene, its photographs).
+    """Load a scene file. Returns (Mitsuba scene, its photographs as `Shot`, without pixels).
 
     Raises InputError if the file cannot be read, or if it has no photographs.
     """

@@ -114,7 +114,7 @@ def slices(outcomes: list[Outcome]) -> Figure:
 
 @of_finished
 def pictures(outcomes: list[Outcome]) -> Figure:
-    """Draw for each run its first photograph, the prediction of the fit, and the error of its normals."""
+    """Draw a row for each run: its first photograph, a rendering of the fitted object, and a map of normal errors."""
     rows = []
     for outcome in outcomes:
         folder, dataset = outcome.folder, outcome.run.dataset

@@ -86,7 +86,7 @@ def one_mesh(options: ExperimentOptions) -> Path | None:
 
 
 def short_name(material: str) -> str:
-    """Return a short name of a material for file names. It consists of the plugin or the file, and the roughness."""
+    """Return a short name of a material for file names: the name of its BSDF plugin or its file, and its roughness."""
     if ".npz:" in material:
         return material.rpartition(":")[2]
     words = material.split()

@@ -137,7 +137,10 @@ class CovarianceGroup:
         return prediction.with_views(replace(photographs, room=room), calibration(self.scale).to(self.problem.device))
 
     def direct(self) -> tuple[Tensor, Tensor]:
-        """Render direct light. Returns linear radiance (n, H, W, 3) and coverage (n, H, W)."""
+        """Render direct light.
+
+        Returns linear radiance (n, H, W, 3) and coverage (n, H, W), the object's share of each pixel.
+        """
         shadows = self.problem.config.shadows and self.problem.capture.shadows
         return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 

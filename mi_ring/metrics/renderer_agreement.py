@@ -134,7 +134,7 @@ def probability(p: float) -> str:
 
 
 def comparison_table(rows: list[Comparison]) -> str:
-    """Format comparisons as a text table with one line each. Shares are in % of the mean radiance of `path`."""
+    """Format comparisons as a text table with one line each. Shares are in % of the path tracer's mean radiance."""
     cells: list[tuple[str, ...]] = [(
         "", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
         "unexplained %", "p direct", "p path",

@@ -28,8 +28,8 @@ class FittedObject(nn.Module):
     `center` (3,), `radius`: normalising sphere [scene units]. `domain`: the start surface; default: the unit sphere.
     `parameters`: the BSDF parameters that Ψ predicts. `bsdf`: Mitsuba's XML of the BSDF that reads them. `indirect`:
     the fit and its pictures include interreflection. `subdivisions`: level of the mesh in the results; finer levels are
-    less certain. `networks`: (Shape-Net Φ, BRDF-Net Ψ). Without them, the networks of the paper are made from `steps`,
-    `scale` and `parameters`; see `mi_ring.nets.shape_net.Flow` and `mi_ring.nets.brdf_net.MaterialNet`.
+    less certain. `networks`: (Shape-Net Φ, BRDF-Net Ψ). Without them, the networks of the paper are made: `steps` is
+    the number of Euler steps of the flow Φ, `scale` the order of magnitude of the reflectances.
 
     `ground` (2, 3): a point of the table below the object and the table's unit normal. Surface points below the table
     are moved up to the table. `up` (3,), the up direction, and `metres`, the length of a scene unit [m], are for
