@@ -213,7 +213,7 @@ def blur(images: Tensor, sigma: float) -> Tensor:
 def write_image(pixels: np.ndarray, path: Path) -> None:
     """Write an image (H, W, C) to a file. The suffix of `path` chooses the format: .png, .exr, otherwise JPEG.
 
-    For PNG and JPEG, `pixels` are uint8 sRGB values. For OpenEXR, they are linear floats.
+    `pixels` are written as they are: uint8 or uint16 for PNG, uint8 for JPEG, floats for OpenEXR.
     """
     formats = mi.Bitmap.FileFormat
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)

@@ -58,7 +58,8 @@ class Dataset:
 def given(path: Path) -> Dataset:
     """Return the dataset of a user's capture. `path`: the folder of the capture, or its scene file.
 
-    The true mesh is truth/mesh.ply beside the scene file. Raises InputError if the scene file or this mesh is missing.
+    The true mesh is truth/mesh.ply beside the scene file NAME.xml, or NAME/truth/mesh.ply. Raises InputError if the
+    scene file or the mesh is missing.
     """
     scene = path / "scene.xml" if path.is_dir() else path
     require_file(scene, WANTED)

@@ -61,8 +61,9 @@ def number_of_bases(values: Tensor) -> Tensor:
 def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
     """Arrange the material parameters of V points as a matrix (V, C) of numbers near 1.
 
-    `material`: a dict from names of parameters to values (V, …). A parameter without upper bound is divided by the
-    initial reflectance of `brdf_net`. Any other parameter is mapped from its range to [0, 1].
+    `material`: a dict from names of parameters to values (V, …). A parameter without upper bound is divided by
+    `brdf_net.scale`, the order of magnitude of the reflectances. Any other parameter is mapped from its range to [0,
+    1].
     """
     columns = []
     for p in brdf_net.bsdf_parameters:

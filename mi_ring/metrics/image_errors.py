@@ -23,8 +23,8 @@ def compare_photographs(
 
     `index`: the photographs to compare; None: all. `spp`: samples per pixel. Returns (totals, list with one dict for
     each photograph). Totals are `psnr` [dB] of the mean squared error and the mean `ssim`; each photograph has both and
-    its `name`. Both images are compared as 8-bit sRGB, at valid pixels; in a lit room, only inside the mask. `psnr` is
-    missing if there is no error.
+    its `name`. The comparison is in sRGB, with renderings rounded to 8 bits, at valid pixels; in a lit room, only
+    inside the mask. `psnr` is missing if there is no error.
     """
     surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))

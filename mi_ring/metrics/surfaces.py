@@ -91,10 +91,11 @@ def compare_surfaces(
 ) -> tuple[dict[str, float], list[dict]]:
     """Compare two surfaces, `guess` and `truth`, in all photographs.
 
-    Returns (errors of all together, list with one dict each). Errors are dicts with mean and median of the errors of
-    normals [deg] and of depths [% of `diagonal`], at pixels that see both surfaces; `iou`, the intersection over union
-    of the silhouettes; and `flipped`, the share of the pixels of `guess` that see the back of a face. `diagonal`: of
-    the true bounding box [scene units]. Raises InputError if no pixel sees both surfaces.
+    Returns (errors of all photographs together, list with errors of each), as dicts. They have mean and median of the
+    errors of normals [deg] and of depths [% of `diagonal`], at pixels that see both surfaces, and `iou`, the
+    intersection over union of the silhouettes. For all together, `flipped` is the share of the pixels of `guess` that
+    see the back of a face. `diagonal`: of the true bounding box [scene units]. Raises InputError if no pixel sees both
+    surfaces.
     """
     angles, depths, views, backs, pixels = [], [], [], 0, 0
     for k, name in enumerate(capture.names):
