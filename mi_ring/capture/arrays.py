@@ -56,10 +56,10 @@ def shots_of(
 ) -> tuple[Shot, ...]:  # fmt: skip
     """Check cameras, lights and names, and make a `Shot` of each photograph. The result does not contain pixels.
 
-    `images`: N checked arrays (H, W, 3). `cameras`: N. `lights`: N lights; None for a light at the camera. `names`:
-    None for 000, 001, …. `encoding`: "auto", "srgb" or "linear". `saturation`: encoded value (1 = full scale) from
-    which a pixel is clipped. `calibrated`: True if cameras and lights are exact. Raises InputError if an argument is
-    invalid.
+    `images`: N checked arrays (H, W, 3). `cameras`: N cameras. `lights`: N lights; None for a light at the camera.
+    `names`: N names; None for 000, 001, …. `encoding`: "auto", "srgb" or "linear". `saturation`: encoded value (1 =
+    full scale) from which a pixel is clipped. `calibrated`: True if cameras and lights are exact. Raises InputError if
+    an argument is invalid.
     """
     count = len(images)
     full = float(require_numbers(saturation, (), "saturation"))

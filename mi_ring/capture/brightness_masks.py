@@ -16,9 +16,9 @@ from mi_ring.images import box_filter
 def with_masks_by_brightness(capture: Capture) -> Capture:
     """Return a copy of the capture with new masks, which contain the bright pixels of each photograph.
 
-    The threshold is estimated for all photographs together. If the room was lit, `capture` itself is returned. A mask
-    contains only the lit part of the object, because the rest may be as dark as the room. A photograph in which no
-    light reaches the object gets no mask.
+    Pixels above a threshold are bright. One threshold is estimated from all photographs together. If the room was lit,
+    `capture` itself is returned. A mask contains only the lit part of the object, because the rest may be as dark as
+    the room. A photograph in which no light reaches the object gets no mask.
     """
     threshold = dark_threshold(capture)
     if threshold is None:

@@ -222,8 +222,8 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
     """Find the XML elements of photographs in a scene. Returns a list of (element, index of its shot in `shots`).
 
     An element belongs to the shot whose name is its id; without ids, to the shot at the same position. If there are
-    more elements than shots, elements without a shot are removed from `root`. Raises InputError if elements without ids
-    leave this open.
+    more elements than shots, elements without a shot are removed from `root`. Raises InputError if this is impossible
+    because ids are missing.
     """
     elements = root.findall(".//sensor[@type='photograph']")
     named = {shot.name: k for k, shot in enumerate(shots)}

@@ -23,7 +23,7 @@ def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
 
 
 def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
-    """Return slices (count, angles, 3) [1/sr] of `count` materials, for light and camera in the same direction.
+    """Return BRDF values (count, angles, 3) [1/sr] of `count` materials, for light and camera in the same direction.
 
     The angles between this direction and the normal are `ANGLES`, 0° to 75°. `bsdf`: textures of its parameters have
     one pixel for each material, in a row.

@@ -51,8 +51,8 @@ def path_traced(
 ) -> Synthetic:
     """Return a dataset of path-traced photographs of a mesh, as in the paper. Nothing is rendered yet.
 
-    `mesh`: None for the pot of `mi-ring example`. `material`: as in `mi-ring synthesize`; None: its default. `name`: of
-    the dataset; empty: name of the mesh. `more`: other options of `mi-ring synthesize`.
+    `mesh`: None for the pot of `mi-ring example`. `material`: as in `mi-ring synthesize`; None: its default. `name`:
+    name of the dataset; empty: the name of the mesh. `more`: other options of `mi-ring synthesize`.
     """
     settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[options.size], **more}
     config = SynthesizeConfig(Path(), Path(), material, **settings)

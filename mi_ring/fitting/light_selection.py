@@ -175,8 +175,9 @@ class CoarseFits:
     def with_material(self, lighting: Lighting) -> Lighting:
         """Decide whether a fit under `lighting` should begin with one material for the whole object.
 
-        It should if a coarse fit with one material explains the photographs about as well. Returns a copy of `lighting`
-        with this decision and with the lamps that the coarse fit has found. Runs coarse fits.
+        It should if a coarse fit with one material explains the photographs about as well as one with a varying
+        material. Returns a copy of `lighting` with this decision and with the lamps that the coarse fit has found. Runs
+        coarse fits.
         """
         one = lighting._replace(one_material_until=1.0)
         if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):

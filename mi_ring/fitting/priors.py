@@ -96,5 +96,5 @@ def albedo_variation(it: Iteration) -> Tensor:
 
 
 def material_rank(it: Iteration) -> Tensor:
-    """Compute the term `material_rank`: about how many basis materials the material is a sum of, as a smooth number."""
+    """Compute the term `material_rank`: a smooth measure of how many basis materials the material consists of."""
     return number_of_bases(columns_of(it.prediction.material, it.context.model.ring.brdf_net))

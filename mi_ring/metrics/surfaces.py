@@ -69,10 +69,10 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Trace a ray through the centre of each of the P pixels of a photograph. `photograph`: its camera.
+    """Trace a ray through the centre of each of the P pixels of a photograph.
 
-    Returns (whether the ray hits (P,) bool, distance (P,), shading normal (P, 3), whether it hits a back face (P,)
-    bool).
+    `photograph`: its camera, as the renderer takes it. Returns (whether the ray hits a surface (P,) bool, distance
+    (P,), shading normal (P, 3), whether it hits the back of a face (P,) bool).
     """
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
