@@ -38,9 +38,10 @@ def overview() -> str:
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int | None:
-    """Import the command `name` and run it. Returns its exit status; None stands for 0.
+    """Import the command `name` and run it with `arguments`, the words after its name.
 
-    Raises InputError if Mitsuba cannot be imported. Only `doctor` works without Mitsuba.
+    Returns its exit status; None stands for 0. Raises InputError if Mitsuba cannot be imported. Only `doctor` works
+    without Mitsuba.
     """
     if name != "doctor" and not llvm.has_atomic():
         raise InputError(str(llvm.missing()))

@@ -65,7 +65,10 @@ class BatchConfig:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command. Returns its exit status: 1 if not all fits are done."""
+    """Run the command with these arguments of the command line.
+
+    Returns its exit status: 0, or 1 if not all fits are done.
+    """
     own, options = list(arguments), []
     if "--" in own:
         own, options = own[: own.index("--")], own[own.index("--") + 1 :]
@@ -105,9 +108,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def unfinished(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
-    """Find the jobs that are not done yet. Returns the fingerprint of each by job.
+    """Find the jobs whose fits must still be made. Returns a dict from each such job to the hash of its input files.
 
-    Writes the record of every job. A job whose capture is invalid is not returned; its record says that it failed.
+    `masks`: the option --masks of the fits. The state of every job is saved beside its results. A job whose capture is
+    invalid is not returned; its saved state is "failed".
     """
     todo: dict[Job, str] = {}
     done = 0
@@ -129,7 +133,11 @@ def unfinished(jobs: Sequence[Job], masks: str) -> dict[Job, str]:
 
 
 def fit_and_report(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchConfig) -> None:
-    """Fit the jobs `todo`. Prints each change of state and keeps index.html up to date."""
+    """Make the fits of the jobs `todo`. Prints each change of state and keeps index.html up to date.
+
+    `todo`: a dict from jobs to the hashes of their input files. `jobs`: all jobs on the page index.html, finished ones
+    too. `config`: the options of the command.
+    """
     states = {job.name: "waiting" for job in todo}
     starts: dict[str, tuple[int, int]] = {}  #: iteration and number of tries at the last start of each fit
     with progress(None, "fits", total=len(todo), leave=True) as bar:
@@ -159,7 +167,10 @@ def fit_and_report(todo: Mapping[Job, str], jobs: Sequence[Job], config: BatchCo
 
 
 def write_page(jobs: Sequence[Job], out: Path, running: bool) -> None:
-    """Write index.html into the folder `out`. `running`: fits are still running, so the page reloads itself."""
+    """Write index.html, a table of all jobs and their states, into the folder `out`.
+
+    `running`: True while fits are running. The page then reloads itself in the browser.
+    """
     entries = []
     for job in jobs:
         record = job.record

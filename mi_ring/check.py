@@ -39,7 +39,10 @@ class CheckConfig:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command. Returns its exit status: 1 if there is something to correct."""
+    """Run the command with these arguments of the command line. Returns its exit status.
+
+    The status is 1 if the capture has a problem that the user should correct, otherwise 0.
+    """
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.scene_name(config.scene)}.png"
     with Steps(Step(("reading masks", "searching"), 1), Step(("reading",), 5), Step(("inspecting",), 4)):
@@ -47,7 +50,11 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def checked(config: CheckConfig, out: Path) -> int:
-    """Check the capture and write the contact sheet to `out`. Returns the exit status of the command."""
+    """Check the capture, print the table and the findings, and write the contact sheet to the .png file `out`.
+
+    Returns 1 if there is a finding, otherwise 0. Raises InputError if `out` cannot be written or is an image of the
+    scene.
+    """
     capture = load_capture(config.scene, masks=config.masks, width=WIDTH)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: --out: must end in .png")

@@ -12,9 +12,10 @@ RELATIVE = 1  #: rendering intent: relative colorimetric
 
 
 class Statement(NamedTuple):
-    """The colour space that an image file declares. Both fields are None if the file declares none.
+    """The colour space that an image file declares: an ICC `profile` (bytes), or the `exponent` of its tone curve.
 
-    Then 8-bit pixels are sRGB and all others are linear.
+    The tone curve is: linear value = encoded value ^ exponent. The exponent 2.2 means the exact curve of sRGB instead.
+    Both fields are None if the file declares nothing: 8-bit pixels are then sRGB, all others are linear.
     """
 
     profile: bytes | None = None  #: an ICC profile
@@ -65,17 +66,20 @@ def coded_statement(primaries: int, curve: int) -> Statement:
 
 @lru_cache(maxsize=8)
 def is_usual(profile: bytes, linear: bool) -> bool:
-    """Test whether an ICC profile describes sRGB; with `linear`: linear radiance with sRGB's primaries."""
+    """Test whether an ICC profile describes the colour space that is assumed for a file without a profile.
+
+    This is sRGB, or, if `linear` is True, linear radiance with sRGB's primaries.
+    """
     axis = np.linspace(0, 1, 6, dtype=np.float32)
     colours = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(36, 6, 3)
     return bool(np.abs(transformed(colours, profile) - (colours if linear else srgb_to_linear(colours))).max() < 2e-3)
 
 
 def transformed(colours: np.ndarray, profile: bytes) -> np.ndarray:
-    """Convert encoded colours (H, W, 1 or 3) to linear radiance with sRGB's primaries, by an ICC profile.
+    """Convert encoded colours (H, W, 1 or 3) with an ICC profile to linear radiance with sRGB's primaries.
 
-    Returns uint16 for integers and float32 for floats. Raises ValueError if the profile is damaged, or if its colour
-    space is neither RGB nor grey.
+    `profile`: its bytes. Returns the same shape: uint16 for integers, float32 for floats. Raises ValueError if the
+    profile is damaged, or if its colour space is neither RGB nor grey.
     """
     if (space := SPACES.get(profile[16:20])) is None:
         raise ValueError(f"its colour profile is of {profile[16:20].decode('ascii', 'replace').strip()}, not of RGB or "
@@ -98,11 +102,11 @@ def transformed(colours: np.ndarray, profile: bytes) -> np.ndarray:
 
 
 def as_stated(pixels: np.ndarray, said: Statement) -> np.ndarray:
-    """Convert pixels (H, W, C) from the colour space `said`, which their file declares.
+    """Convert pixels (H, W, C) from the colour space `said`, which their file declares. Alpha channels are kept.
 
     8-bit sRGB pixels, and linear pixels of other types with sRGB's primaries, are returned unchanged. All other pixels
     become linear with sRGB's primaries: uint16 if they were integers, float32 if they were floats. Clipped pixels
-    remain clipped. Raises the ValueError of `transformed`.
+    remain clipped. Raises ValueError if an ICC profile is damaged, or if its colour space is neither RGB nor grey.
     """
     kind = pixels.dtype
     count = 3 if pixels.shape[2] > 2 else 1

@@ -31,7 +31,10 @@ class DoctorConfig:
 
 
 class Finding(NamedTuple):
-    """One line of the output of mi-ring doctor."""
+    """One line of the output of mi-ring doctor: (mark, what was examined, text).
+
+    The mark is "ok", "MISSING" if a fit cannot run without it, or "without" if only another feature needs it.
+    """
 
     mark: str  #: ok; MISSING: a fit cannot run; without: something else cannot run
     what: str
@@ -39,7 +42,10 @@ class Finding(NamedTuple):
 
 
 def findings() -> Iterator[Finding]:
-    """Yield a finding for each package and library: is it installed, and if not, how to install it."""
+    """Yield a finding for each package and library. It says the version, or how to install what is missing.
+
+    Findings about the cache folder, the processor and the GPU follow.
+    """
     yield Finding("ok", "mi_ring", __version__)
     yield Finding("ok", "Python", f"{platform.python_version()} on {platform.platform()}")
     for package in ("torch", "drjit", "mitsuba"):
@@ -78,7 +84,10 @@ def computing() -> Iterator[Finding]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command. Returns its exit status: 1 if a fit cannot run."""
+    """Run the command with these arguments of the command line.
+
+    Returns its exit status: 1 if a fit cannot run, otherwise 0.
+    """
     if command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False).empty_cache:
         cache.empty()
     found = list(findings())

@@ -26,14 +26,15 @@ class SceneError(ValueError):
 
 
 def is_file(path: Path) -> bool:
-    """Test whether a file exists. Returns False for a name that is too long; `Path.is_file` would raise an error."""
+    """Test whether a file exists. Returns False if its name is too long for the file system."""
     return os.path.isfile(path)
 
 
 def require_file(path: Path, wanted: str, field: str = "") -> None:
-    """Raise InputError if the file `path` does not exist. The message contains `field` and ends with "give `wanted`".
+    """Raise InputError if `path` is not a file. The message has the form "path: field: no such file; give `wanted`".
 
-    `field`: option or field that names the file. `wanted`: description of the file that is needed.
+    `field`: option or field that names the file; it is left out if it is empty. `wanted`: description of the file that
+    is needed, such as "the results folder of a fit".
     """
     if not is_file(path):
         what = "is a folder" if os.path.isdir(path) else "no such file"
@@ -43,7 +44,7 @@ def require_file(path: Path, wanted: str, field: str = "") -> None:
 def require_range(options: Any, name: str, low: float, high: float = math.inf) -> None:
     """Raise InputError if an option is less than `low` or greater than `high`. An option that is None is allowed.
 
-    `options`: the dataclass of the options. `name`: the field of the option.
+    `options`: dataclass instance with the options of a command. `name`: name of the field in it.
     """
     value = getattr(options, name)
     if value is not None and not low <= value <= high:
@@ -52,9 +53,9 @@ def require_range(options: Any, name: str, low: float, high: float = math.inf) -
 
 
 def require_numbers(value: ArrayLike, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert a value to a float32 array of this shape.
+    """Convert a value to a float32 array, and check that it has this shape and only finite numbers.
 
-    Raises InputError, which begins with `what`, if that is impossible.
+    Raises InputError otherwise. The message begins with `what`, the name of the value.
     """
     try:
         array = np.asarray(value, float)

@@ -15,10 +15,10 @@ KINDS = ("used", "refused", "told", "harmless")  #: of fields, as the attributes
 class Fields:
     """The fields of a file format in four groups: mi_ring uses, refuses, reports or ignores them.
 
-    Each group is a dictionary of texts by field names. The text is the meaning of a used field; for the other groups it
-    is the reason why the field is not used. A key contains one or more names, separated by spaces. In a name, `*`
-    stands for any text. The name of a nested field begins with the name of its parent: see `json_names` and
-    `xml_names`. A name that ends in `/*` includes all nested fields.
+    Each group is a dict from field names to a text. For used fields, the text is their meaning. For the other groups,
+    it is the reason why they are not used. A key contains one or more names, separated by spaces. In a name, `*` stands
+    for any text. A nested field is named parent/name, an XML attribute element@name. A name that ends in `/*` includes
+    all nested fields. A field of `refused` causes an error, unless its value is 0, empty or the usual one.
     """
 
     used: Mapping[str, str]
@@ -27,7 +27,10 @@ class Fields:
     harmless: Mapping[str, str] = field(default_factory=dict)  #: not used, because they change nothing
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
-        """Yield all entries as (names, group, text). The group is one of `KINDS`."""
+        """Yield all entries as (names, group, text). `names` are separated by spaces.
+
+        The group is "used", "refused", "told" (reported to the user) or "harmless" (ignored).
+        """
         for kind in KINDS:
             for names, why in getattr(self, kind).items():
                 yield names, kind, why
@@ -38,24 +41,32 @@ class Fields:
 
     @cached_property
     def patterns(self) -> list[tuple[re.Pattern[str], str, str]]:
-        """All `rows` as (regular expression that matches the names, group, text)."""
+        """List of (regular expression, group, text), one for each entry.
+
+        The expression matches each name of the entry.
+        """
         return [(re.compile("|".join(translate(name.removesuffix("/*")) for name in names.split())), kind, why)
                 for names, kind, why in self.rows()]  # fmt: skip
 
     def kind_of(self, name: str) -> tuple[str, str]:
-        """Return (group, text) of the field `name`; ("unknown", "unknown") if no group contains the field."""
+        """Return (group, text) of the field `name`.
+
+        The group is "used", "refused", "told" (reported to the user) or "harmless" (ignored). Group and text are
+        "unknown" if no group contains the field.
+        """
         found = ((kind, why) for pattern, kind, why in self.patterns if pattern.match(name))
         return next(found, ("unknown", "unknown"))
 
     @cached_property
     def closed(self) -> set[str]:
-        """Names of the fields that include all nested fields; these are not listed one by one."""
+        """Names that end in `/*`, without this ending. The nested fields of such a field are not listed one by one."""
         return {name.removesuffix("/*") for name in self.names() if name.endswith("/*")}
 
     def unused(self, names: Iterable[str]) -> dict[str, str]:
-        """Find fields that the user must be told about: fields of the group `told`, and unknown fields.
+        """Find the fields of a file that are not used and about which the user must be told.
 
-        `names`: the fields of a file. Returns by name the reason why the field is not used, or "unknown".
+        `names`: names of all fields of the file. Returns a dict from the names of these fields to the reason why each
+        is not used. For a field that no group contains, the reason is "unknown".
         """
         kinds = {name: self.kind_of(name) for name in dict.fromkeys(names)}
         return {name: why for name, (kind, why) in kinds.items() if kind in ("told", "unknown")}
@@ -64,7 +75,8 @@ class Fields:
 def json_names(value: Any, closed: set[str], parent: str = "") -> Iterator[str]:
     """Yield the names of all fields in a JSON value. A nested field is named parent/name; lists add no level.
 
-    `closed`: names of fields whose nested fields are skipped. `parent`: the first part of all names, with its slash.
+    `closed`: names of fields whose nested fields are skipped. `parent`: text before all names: the name of the parent
+    and a slash; empty for the whole file.
     """
     if isinstance(value, dict):
         for key, own in value.items():

@@ -37,7 +37,11 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def run(arguments: Sequence[str], processes: Processes) -> int:
-    """Run the command in this process. Returns the exit status as `main`. `processes`: all processes of the fit."""
+    """Run the command in this process.
+
+    Returns the exit status: 0, or 128 + the number of the signal that stopped the fit. `processes`: all processes that
+    compute this fit together.
+    """
     started = time.monotonic()
     config, choice, state = processes.on_first(lambda: asked(arguments))
     folder = config.folder
@@ -71,9 +75,10 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
 
 
 def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fit:
-    """Make a new fit, before its first iteration. If the light is unknown, coarse fits first find its kind.
+    """Make a new fit, before its first iteration. If the light is unknown, coarse fits first find out what kind it is.
 
-    The recorded time of the fit includes these coarse fits.
+    `processes`: all processes that compute this fit together. The recorded duration of the fit includes the coarse
+    fits.
     """
     began = time.perf_counter()
     lighting = processes.broadcast(processes.agreed(lambda: choose_lighting(capture, config)))
@@ -84,10 +89,10 @@ def started_fit(capture: Capture, config: FitConfig, processes: Processes) -> Fi
 
 
 def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | None]:
-    """Read the arguments of the command line.
+    """Read the arguments of the command line. Returns (options, alternatives, checkpoint).
 
-    Returns (options; the alternatives that --minutes chooses from; with --resume the content of the checkpoint,
-    otherwise None).
+    The alternatives are the option sets from which --minutes chooses. The checkpoint is the content of the newest one
+    if --resume is given, otherwise None.
     """
     config = parse_options(arguments)
     choice = choice_of(config, arguments)
@@ -100,16 +105,19 @@ def asked(arguments: Sequence[str]) -> tuple[FitConfig, list[FitConfig], dict | 
 
 
 def same_variant(variant: str) -> None:
-    """Switch Mitsuba to `variant`, which the first process uses. Raises InputError if this process cannot use it."""
+    """Switch Mitsuba in this process to `variant`, with which the first process computes.
+
+    Raises InputError if this process cannot use it.
+    """
     if set_variant(variant) != variant:
         raise InputError(f"--variant {variant}: this process has no GPU to use; give llvm_ad_rgb")
 
 
 def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
-    """List the configurations that --minutes chooses from.
+    """List the option sets from which --minutes chooses. `config`: the options as given.
 
-    They are one per preset that does not contradict the other options. If --preset or no --minutes is given, there is
-    only `config`. Raises InputError if --minutes and --iterations are both given.
+    There is one for each preset that does not contradict the other options. If --preset is given, or if --minutes is
+    not given, the list contains only `config`. Raises InputError if --minutes and --iterations are both given.
     """
     if config.minutes and given(arguments, "--iterations"):
         raise InputError("--minutes: chooses --iterations; give one of the two")
@@ -122,10 +130,10 @@ def choice_of(config: FitConfig, arguments: Sequence[str]) -> list[FitConfig]:
 
 
 def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitConfig, Costs]:
-    """Choose the configuration of `choice` whose fit takes --minutes. Measures iterations of `fit` for this.
+    """Choose the option set of `choice` whose fit takes --minutes. Measures how long iterations of `fit` take.
 
-    Returns (configuration, measured costs of iterations). `started`: start time of the command, by `time.monotonic`.
-    Raises InputError if --minutes is too short for every configuration.
+    `started`: start time of the command on the clock `time.monotonic` [s]. Returns (option set with its number of
+    iterations, measured seconds per iteration). Raises InputError if --minutes is too short for every option set.
     """
     minutes, processes = choice[0].minutes, fit.problem.processes
     spent = processes.broadcast(time.monotonic() - started)
@@ -142,10 +150,10 @@ def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitC
 
 
 def planned_before(config: FitConfig, choice: Sequence[FitConfig], folder: Path) -> FitConfig:
-    """Find the configuration that --minutes chose when the fit was started. Reads config.json in `folder`.
+    """Find the options that --minutes chose when the fit was started. They are read from config.json in `folder`.
 
-    Without --minutes, or if config.json cannot be read, it returns `config`. Raises InputError if --minutes is not the
-    same as before.
+    `config`: the options of this call. `choice`: the option sets from which --minutes chooses. Returns `config` if
+    --minutes is not given or config.json cannot be read. Raises InputError if --minutes is not the same as before.
     """
     try:
         before = read_json(folder / "config.json")

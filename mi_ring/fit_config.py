@@ -64,12 +64,12 @@ class FitConfig(Config, Task):
 
     @property
     def thread_count(self) -> int:
-        """Number of threads to compute with; 0: one per core."""
+        """Number of threads to compute with; 0: one per core. It is 1 for a deterministic fit."""
         return 1 if self.deterministic else self.threads
 
     @property
     def folder(self) -> Path:
-        """The folder of the results."""
+        """The results folder: --out, or the default folder for the scene file."""
         return self.out or results.default_folder(self.scene)
 
 
@@ -99,10 +99,10 @@ def parse_options(arguments: Sequence[str]) -> FitConfig:
 
 
 def command_line(brief: bool) -> tuple[Any, dict[str, Any]]:
-    """Make the dataclass that tyro parses. A nested dataclass holds the options of each group in `GROUPS`.
+    """Make the dataclass that tyro parses. It has one nested dataclass for each group of options.
 
-    Returns (dataclass, nested dataclasses by group name). Nested options keep their names: --levels, not
-    --tuning.levels. `brief`: tyro neither shows nor parses the nested options.
+    Returns (dataclass, dict from group names to nested dataclasses). Nested options keep their names: --levels, not
+    --tuning.levels. `brief`: True if tyro neither shows nor parses the nested options.
     """
     parts, nested, hidden = {}, {}, Suppress
     for name, group in GROUPS.items():
@@ -113,10 +113,16 @@ def command_line(brief: bool) -> tuple[Any, dict[str, Any]]:
 
 
 def dataclass_of(name: str, fields: dict[str, Any], *bases: type) -> Any:
-    """Make a frozen dataclass. `fields`: type of each field by name. It inherits the fields of `bases`."""
+    """Make a frozen dataclass called `name`. `fields`: a dict from names of fields to types.
+
+    `bases`: its base classes.
+    """
     return dataclasses.make_dataclass(name, fields.items(), bases=bases, frozen=True, kw_only=True)
 
 
 def built(kind: Any, values: dict[str, Any]) -> Any:
-    """Make an instance of the dataclass `kind`. `values`: value of each field by name; other names are ignored."""
+    """Make an instance of the dataclass `kind`.
+
+    `values`: a dict with a value for each field; other names in it are ignored.
+    """
     return kind(**{f.name: values[f.name] for f in dataclasses.fields(kind)})

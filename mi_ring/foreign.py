@@ -31,9 +31,9 @@ except (ImportError, OSError, ValueError):
 
 @contextlib.contextmanager
 def reading(where: Path | str, what: str) -> Iterator[None]:
-    """Context manager that turns every error in its block into an InputError.
+    """Context manager that turns every error in its block into an InputError of one line.
 
-    The message says: `where` cannot be read as `what`. `where`: the file. `what`: the expected content.
+    The message says that `where`, a file, cannot be read as `what`, the expected content. An InputError stays as it is.
     """
     try:
         yield
@@ -45,20 +45,20 @@ def reading(where: Path | str, what: str) -> Iterator[None]:
 
 
 def require_plausible_size(path: Path, size: int) -> None:
-    """Raise ValueError if a file is too small for the content that it declares. Reading it could exhaust the memory.
+    """Raise ValueError if a file declares a content so large that reading it could exhaust the memory.
 
-    `size`: number of bytes of the content, as the file declares it. It may be up to `EXPANSION` times the size of the
-    file on disk, or up to `SMALL` if that is more.
+    `size`: number of bytes of the content, as the file declares it. Up to 256 MiB are allowed, and more for large
+    files: up to 4096 times the size of the file on disk.
     """
     if size > max(SMALL, EXPANSION * path.stat().st_size):
         raise ValueError(f"declares {size:,} bytes, in a file of {path.stat().st_size:,}")
 
 
 def require_readable(read: str, path: Path, size: int, what: str) -> None:
-    """Raise InputError if a native reader fails, crashes, hangs or exhausts the memory on the file `path`.
+    """Raise InputError if a native library fails, crashes, hangs or exhausts the memory when it reads the file `path`.
 
-    A child process tries the reader, because Ctrl-C does not stop a native reader that hangs. `read`: Python code that
-    calls the reader; it finds the path in sys.argv[1]. `size`: number of bytes to read. `what`: the expected content.
+    The library is tried in a child process, because Ctrl-C does not stop native code that hangs. `read`: Python code
+    that reads the file; the path is in sys.argv[1]. `size`: number of bytes to read. `what`: the expected content.
     """
     try:
         trial = [sys.executable, "-c", LIMIT_MEMORY + read, str(path), str(2**31 + 40 * size)]
@@ -71,7 +71,7 @@ def require_readable(read: str, path: Path, size: int, what: str) -> None:
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read a .npz file. Returns its arrays by name. Raises InputError if the file cannot be read."""
+    """Read a .npz file. Returns a dict from names to arrays. Raises InputError if the file cannot be read."""
     with reading(path, "arrays of NumPy's, .npz"), zipfile.ZipFile(path) as archive:
         require_plausible_size(path, sum(member.file_size for member in archive.infolist()))
         return {name.removesuffix(".npy"): parse_npy(archive.read(name)) for name in archive.namelist()}

@@ -109,7 +109,8 @@ FIELDS = {
 def field_names(path: Path) -> tuple[str, list[str]]:
     """Read the names of the metadata fields of an image file. Returns (kind of file, names).
 
-    The kind is a key of `FIELDS`. Raises the errors of `open_image`.
+    The kind is PNG, JPEG, TIFF, OpenEXR, raw, or one kind for WebP, AVIF, HEIF and BMP. Names of raw files are not
+    read. Raises ValueError, InputError or another error if the file cannot be opened.
     """
     suffix = path.suffix.lower()
     if suffix == ".exr":
@@ -136,7 +137,8 @@ def field_names(path: Path) -> tuple[str, list[str]]:
 def unused_fields(path: Path) -> dict[str, str]:
     """Find metadata fields of an image file that mi_ring does not use although they may matter.
 
-    Returns by name the reason why the field is not used, or "unknown". Raises the errors of `open_image`.
+    Returns a dict from their names to the reason why each is not used, or "unknown". Raises ValueError, InputError or
+    another error if the file cannot be opened.
     """
     kind, names = field_names(path)
     found = FIELDS[kind].unused(names)

@@ -46,9 +46,9 @@ Image.MAX_IMAGE_PIXELS = None
 
 
 class BoundedFile(io.BufferedReader):
-    """A binary file whose `read` never allocates more memory than the rest of the file, however much is requested.
+    """A binary file whose `read` never allocates more memory than the rest of the file needs.
 
-    Damaged headers may request any amount.
+    This is for damaged headers, after which a reader may request any number of bytes.
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -58,7 +58,7 @@ class BoundedFile(io.BufferedReader):
 
 @contextlib.contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """Context manager that opens an image file with Pillow, without reading its pixels.
+    """Context manager that opens an image file with Pillow, without reading its pixels. Not for OpenEXR and raw files.
 
     Raises ValueError if the file is no image, is CMYK or declares an implausible size. Raises InputError for a HEIF
     file if the package pillow_heif is not installed. A damaged file raises errors of other types.
@@ -81,7 +81,10 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def exif_of(path: Path) -> Image.Exif:
-    """Read the EXIF data of an image file. They are empty if the file has none. Raises the errors of `open_image`."""
+    """Read the EXIF data of an image file. The result is empty if the file has none.
+
+    Raises ValueError if the file is no image or is CMYK. A damaged file raises errors of other types.
+    """
     suffix, exif = path.suffix.lower(), Image.Exif()
     if suffix in (*TIFF, *RAW):  # Pillow does not open all of their pixels
         trouble = () if suffix in TIFF else (Exception,)  # of raw files that are no TIFFs
@@ -97,9 +100,10 @@ def exif_of(path: Path) -> Image.Exif:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Read (width, height) [px] from the header of an image file, as stored.
+    """Read (width, height) [px] of the stored pixels from the header of an image file. EXIF orientation is not applied.
 
-    Raises the errors of `open_image`, `exr_size`, `exr_picture` and `tiff_page`, before pixels are read.
+    Raises ValueError for a file that mi_ring cannot use: for example CMYK, several pictures, or a part of a picture.
+    Raises InputError if a package for the format is not installed. A damaged file raises errors of other types.
     """
     suffix = path.suffix.lower()
     if suffix == ".exr":
@@ -117,7 +121,10 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def require_whole(path: Path) -> None:
-    """Raise ValueError if a JPEG file ends before its pixels do. Pixels are not decoded."""
+    """Raise ValueError if a JPEG file is cut off before the end of its pixels. Other files are not tested.
+
+    The pixels are not decoded.
+    """
     if path.suffix.lower() not in BY_KIND["JPEG"]:
         return
     content, place = path.read_bytes(), 2
@@ -128,9 +135,10 @@ def require_whole(path: Path) -> None:
 
 
 def tiff_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
-    """Return the first page of a TIFF file.
+    """Return the first page of a TIFF file, without reading its pixels.
 
-    Raises ValueError for CMYK and other colours, for integers of more than 16 bits, and for several pictures.
+    Raises ValueError if its colours are neither grey, RGB nor a palette, if its integers have more than 16 bits, or if
+    the file contains several pictures. Smaller previews are allowed.
     """
     page, kinds = file.pages.first, tifffile.PHOTOMETRIC
     if page.photometric == kinds.SEPARATED:
@@ -147,9 +155,10 @@ def tiff_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
 
 
 def tiff_channels(page: tifffile.TiffPage) -> int:
-    """Return how many channels of a TIFF page form the picture: its colours, and alpha if it has one.
+    """Return how many channels of a TIFF page form the picture: one or three for colours, plus one for alpha.
 
-    A channel more is alpha unless the file calls it unspecified; then it may be infrared, for example.
+    A channel after the colours is alpha, unless the file calls it unspecified. An unspecified channel may be infrared,
+    for example.
     """
     colours = 3 if page.photometric in (tifffile.PHOTOMETRIC.RGB, tifffile.PHOTOMETRIC.YCBCR) else 1
     unspecified = page.extrasamples[:1] == (tifffile.EXTRASAMPLE.UNSPECIFIED,)
@@ -157,7 +166,7 @@ def tiff_channels(page: tifffile.TiffPage) -> int:
 
 
 def has_alpha_channel(path: Path) -> bool:
-    """Test whether an image file has an alpha channel. Raises the errors of `open_image`."""
+    """Test whether an image file has an alpha channel. Raises ValueError or another error if it cannot be opened."""
     suffix = path.suffix.lower()
     if suffix in (".jpg", ".jpeg", *RAW):
         return False
@@ -172,10 +181,10 @@ def has_alpha_channel(path: Path) -> bool:
 
 
 def statement_of(path: Path) -> Statement:
-    """Read the colour space that an image file declares. Raises the errors of `open_image`.
+    """Read the colour space that an image file declares.
 
-    A file may declare several. Then the first in this list counts: PNG chunk cICP, ICC profile, codes of HEIF and AVIF,
-    other PNG chunks, Adobe RGB in EXIF data.
+    If a file declares several, the first in this list counts: PNG chunk cICP, ICC profile, codes of HEIF and AVIF,
+    other PNG chunks, Adobe RGB in EXIF data. Raises ValueError if the file cannot be used, for example for HDR colours.
     """
     suffix = path.suffix.lower()
     if suffix == ".exr":
@@ -206,9 +215,9 @@ def statement_of(path: Path) -> Statement:
 
 
 def png_statement(info: dict, bits: int) -> Statement:
-    """Convert the PNG chunks sRGB, gAMA and cHRM to a colour space.
+    """Find the colour space that the PNG chunks sRGB, gAMA and cHRM declare.
 
-    `info`: the metadata that Pillow has read from the file. `bits`: bits per channel.
+    `info`: the metadata of the file, as Pillow reads them (`Image.info`). `bits`: bits per channel.
     """
     if "srgb" in info:
         return Statement(None, 2.2)
@@ -221,7 +230,7 @@ def png_statement(info: dict, bits: int) -> Statement:
 
 
 def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield (name, content) of each chunk of a PNG file that precedes the pixels, at most 64 bytes of the content."""
+    """Yield (name, content) of each chunk of a PNG file before the pixels. Content after 64 bytes is left out."""
     with path.open("rb") as file:
         file.seek(8)
         while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
@@ -245,7 +254,11 @@ def bits_of(path: Path) -> int:
 
 
 def encodings(paths: Sequence[Path]) -> list[str]:
-    """Return clauses for the user that say how many of the files have which encoding: sRGB, linear, or declared."""
+    """Count the files by the encoding of their pixels.
+
+    Returns phrases for the user, such as "3 files of 8 bits are sRGB". The last phrase is the number of files that
+    declare a colour space, if there are any.
+    """
     bits = Counter(bits_of(path) for path in paths)
     said = sum(statement_of(path) != Statement() for path in paths)
     kinds = {8: "8 bits are sRGB", 16: "16 bits are linear", 32: "floats are linear"}
@@ -254,7 +267,7 @@ def encodings(paths: Sequence[Path]) -> list[str]:
 
 
 def encoding_of(path: Path) -> Literal["srgb", "linear"]:
-    """Return the encoding of the pixels that `read_image(path, heed=True)` returns: "srgb" or "linear"."""
+    """Return "srgb" or "linear", the encoding of a file's pixels after its declared colour space has been applied."""
     said = statement_of(path)
     sample = np.zeros((1, 1, 3), np.uint8)
     return "srgb" if bits_of(path) == 8 and as_stated(sample, said).dtype == np.uint8 else "linear"
@@ -264,7 +277,8 @@ def exr_attributes(path: Path) -> Iterator[tuple[bytes, bytes]]:
     """Yield (name, value) of each header attribute of an OpenEXR file, at most 64 KiB of the value.
 
     The format is described in "OpenEXR File Layout": an attribute consists of its name, its type, its size and its
-    value; a zero byte ends the name and the type. Raises ValueError if it is no OpenEXR file or has several parts.
+    value; a zero byte ends the name and the type. Raises ValueError if the file is no OpenEXR file or has several
+    parts.
     """
     with path.open("rb") as file:
 
@@ -299,8 +313,8 @@ def exr_channels(value: bytes) -> list[str]:
 def exr_picture(names: Sequence[str]) -> list[str]:
     """Choose the channels of an OpenEXR file that form the picture: R, G, B and A; or Y and A; or the only channel.
 
-    `names`: all channel names. A name may begin with a layer, as in `ViewLayer.Combined.R`. Raises ValueError if no
-    channels form a picture, or if several layers do.
+    `names`: all channel names. A name may begin with a layer, as in `ViewLayer.Combined.R`. Returns the chosen names in
+    this order; a file may lack A. Raises ValueError if no channels form a picture, or if several layers do.
     """
     layers = [name.removesuffix("R") for name in names if name == "R" or name.endswith(".R")]
     layers = [layer for layer in layers if {f"{layer}{c}" for c in "RGB"} <= {*names}]

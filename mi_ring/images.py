@@ -46,8 +46,8 @@ def linear_to_srgb(v: np.ndarray) -> np.ndarray:
 def contrasted(linear: Pictures, contrast: Any) -> Pictures:
     """Apply an S-curve, like the curve of film, to linear values of any shape. Values of at least 1 do not change.
 
-    In terms of the sRGB value v, the curve is vᶜ / (vᶜ + (1 − v)ᶜ), where c is `contrast`. The curve with contrast
-    1 / c is the inverse. Returns linear values.
+    In terms of the sRGB value v, the curve is vᶜ / (vᶜ + (1 − v)ᶜ), where c is `contrast`, a number above 0. Contrast 1
+    changes nothing, and contrast 1 / c undoes the curve. Returns linear values.
     """
     where: Any = torch.where if isinstance(linear, Tensor) else np.where
     x = linear.clip(1e-6, 1 - 1e-6)  # so that the powers have finite derivatives
@@ -64,7 +64,10 @@ def to_bytes(encoded: np.ndarray) -> np.ndarray:
 
 
 def box_filter(image: Tensor, scale: int) -> Tensor:
-    """Average blocks of `scale` × `scale` pixels: (H, W, C) → (H // scale, W // scale, C)."""
+    """Average blocks of `scale` × `scale` pixels: (H, W, C) → (H // scale, W // scale, C).
+
+    Incomplete blocks are left out.
+    """
     if scale == 1:
         return image
     return F.avg_pool2d(image.permute(2, 0, 1), scale).permute(1, 2, 0)
@@ -73,11 +76,11 @@ def box_filter(image: Tensor, scale: int) -> Tensor:
 def read_image(path: Path, heed: bool = False) -> np.ndarray:
     """Read the pixels (H, W, C) of an image file: uint8, uint16 or float32. Raw files become linear uint16.
 
-    `heed`: apply the colour space that the file declares: the result is sRGB if it is uint8, otherwise linear; see
-    `colour_profiles.as_stated`. If it is false, the pixels are returned as they are stored.
+    `heed`: True applies the colour space that the file declares. The result is then sRGB if it is uint8, otherwise
+    linear with sRGB's primaries. False returns the pixels as they are stored.
 
     Raises ValueError for CMYK, for integers of more than 16 bits, for files of several pictures and for an implausible
-    size. It checks the size before it allocates memory. Damaged files raise errors of other types.
+    size. The size is checked before memory is allocated. Damaged files raise errors of other types.
     """
     suffix = path.suffix.lower()
     if suffix in TIFF:
@@ -101,7 +104,11 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
 
 
 def read_tiff(path: Path) -> np.ndarray:
-    """Read the pixels (H, W, C) of the first page of a TIFF file. Raises the errors of `read_image`."""
+    """Read the pixels (H, W, C) of the first page of a TIFF file; (H, W) if there is one channel.
+
+    They are uint8, uint16 or float32. Raises ValueError for CMYK, for integers of more than 16 bits, for files of
+    several pictures and for an implausible size.
+    """
     kinds = tifffile.PHOTOMETRIC
     with tifffile.TiffFile(path) as file:
         page = tiff_page(file)
@@ -131,9 +138,10 @@ def read_tiff(path: Path) -> np.ndarray:
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """Read the picture in an OpenEXR file: (H, W, C) float32. `exr_picture` chooses the channels.
+    """Read the picture in an OpenEXR file: (H, W, C) float32. The channels are R, G, B, A, or Y, A, or the only one.
 
-    Raises ValueError for an implausible size, and the errors of `exr_picture` and `exr_size`.
+    Raises ValueError if no channels form a picture, if the file has several parts or layers or only a part of the
+    picture, and for an implausible size.
     """
     width, height, channels = exr_size(path)
     require_plausible_size(path, 4 * width * max(height, EXR_CHUNK) * channels)
@@ -156,10 +164,10 @@ def read_raw(path: Path) -> np.ndarray:
 
 
 def mask_values(pixels: np.ndarray) -> np.ndarray:
-    """Convert the pixels (H, W, C) of a mask file to the mask (H, W) uint8, from 0 to 255.
+    """Convert the pixels (H, W, C) of a mask file to the mask (H, W) uint8, from 0 (background) to 255 (object).
 
-    The mask is the alpha channel if there is one and it is not constant. Otherwise it is the channel that varies most,
-    because the object may have any colour. If there is one value beside 0, such as the label 1, it becomes 255.
+    The mask is the alpha channel if it is not constant. Otherwise it is the colour channel that varies most, because
+    the object may have any colour. If all values above 0 are equal, such as the label 1, they become 255.
     """
     count = pixels.shape[2]
     extent = np.ptp(pixels, (0, 1))
@@ -173,17 +181,16 @@ def mask_values(pixels: np.ndarray) -> np.ndarray:
 
 
 def orientation_axes(orientation: int) -> np.ndarray:
-    """Return the matrix (3, 3) that an EXIF `orientation` (1 to 8) applies to directions.
+    """Return the matrix (3, 3) that turns directions from the stored image to the upright image.
 
-    It maps a direction in the axes of the stored image to the axes of the upright image. Both have x right, y down, z
-    forward.
+    `orientation`: the EXIF orientation, 1 to 8. In both images, the axes are x right, y down, z forward.
     """
     column, row = [(1, 1), (-1, 1), (-1, -1), (1, -1)][(orientation - 1) % 4]
     return np.diag([column, row, 1.0]) @ np.eye(3)[[1, 0, 2] if orientation > 4 else [0, 1, 2]]
 
 
 def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Rotate or mirror pixels (H, W, …) so that the image is upright. `orientation`: from EXIF data, 1 to 8."""
+    """Rotate or mirror pixels (H, W, …) so that the image is upright. `orientation`: the EXIF orientation, 1 to 8."""
     column, row = orientation_axes(orientation)[:2, :2].sum(1).astype(int)
     return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation > 4 else pixels)[::row, ::column])
 
@@ -204,7 +211,10 @@ def blur(images: Tensor, sigma: float) -> Tensor:
 
 
 def write_image(pixels: np.ndarray, path: Path) -> None:
-    """Write an image (H, W, C) to a file. The suffix of `path` chooses the format: .png, .exr, otherwise JPEG."""
+    """Write an image (H, W, C) to a file. The suffix of `path` chooses the format: .png, .exr, otherwise JPEG.
+
+    `pixels` are written as they are: uint8 or uint16 for PNG, uint8 for JPEG, floats for OpenEXR.
+    """
     formats = mi.Bitmap.FileFormat
     kind = {".png": formats.PNG, ".exr": formats.OpenEXR}.get(path.suffix.lower(), formats.JPEG)
     stream = mi.MemoryStream()
@@ -214,7 +224,10 @@ def write_image(pixels: np.ndarray, path: Path) -> None:
 
 
 def encoded_picture(picture: Image.Image, kind: str = "PNG", **options: Any) -> bytes:
-    """Encode a Pillow image in the file format `kind`. Returns the bytes. `options`: options of Pillow's `save`."""
+    """Encode a Pillow image as the bytes of a file.
+
+    `kind`: Pillow's name of the file format. `options`: arguments of Pillow's `Image.save`.
+    """
     buffer = io.BytesIO()
     picture.save(buffer, kind, **options)
     return buffer.getvalue()

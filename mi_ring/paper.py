@@ -70,7 +70,10 @@ class PaperConfig:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command. Returns its exit status: 1 if a run has failed."""
+    """Run the command with these arguments of the command line.
+
+    Returns its exit status: 1 if a run has failed, otherwise 0.
+    """
     config = command.parse(PaperConfig, arguments, "mi_ring.paper")
     experiment = EXPERIMENTS[config.name]
     require_range(config, "threads", 0, MOST_THREADS)

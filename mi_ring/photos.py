@@ -94,12 +94,18 @@ class PhotosConfig:
             need("rembg", "--masks rembg")
 
     def words(self) -> list[str]:
-        """List all options as strings. They are stored to recognise the same command later."""
+        """List all options as strings "name: value". They are stored in the output folder.
+
+        When the command runs again, they show whether its options are the same.
+        """
         return [f"{name}: {v.resolve() if isinstance(v, Path) else v}" for name, v in vars(self).items()]
 
 
 def cameras_report(sparse: SparseModel) -> str:
-    """Return a text for the user: one line about all cameras, and one line per photograph without a camera."""
+    """Return a text for the user: one line about all cameras, and one line per photograph whose camera was not found.
+
+    `sparse`: the cameras and 3-D points that structure from motion has found.
+    """
     count, failed = len(sparse.cameras), sparse.failed
     how = f"as given by {sparse.source}" if sparse.source else f"by {len(sparse.points)} points"
     how += f", reprojection error {sparse.error:.2f} px" if sparse.error else ""
@@ -112,7 +118,7 @@ def cameras_report(sparse: SparseModel) -> str:
 def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path) -> str:
     """Return a text for the user: one line about all masks, and one line per photograph without a mask.
 
-    `source`: the value of `PhotosConfig.masks`.
+    `found`: the masks. `sparse`: the cameras. `source`: where the masks come from, the option --masks.
     """
     without = [name for name in sparse.cameras if name not in found.masks]
     why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
@@ -123,7 +129,10 @@ def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path
 
 
 def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedObject) -> str:
-    """Return one line for the user about the flash, the room's light and the camera's response."""
+    """Return one line for the user about the flash, the room's light and the camera's response.
+
+    `flash`: their values, measured on the printed sheet. `sparse`: the cameras. `found`: the object with its centre.
+    """
     x, y, z = flash.offset
     where = f"{abs(x):.0f} mm {'left' if x < 0 else 'right'}, {abs(y):.0f} mm {'above' if y < 0 else 'below'}, "
     where += f"{abs(z):.0f} mm {'behind' if z < 0 else 'before'} the lens"
@@ -155,7 +164,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def require_apart(config: PhotosConfig) -> None:
-    """Raise InputError if output files would be written among the given photographs or masks."""
+    """Raise InputError if FOLDER or the folder of --masks is a folder that the command will write."""
     given = {"FOLDER": config.folder} | ({"--masks": config.masks} if isinstance(config.masks, Path) else {})
     out = config.out.resolve()
     written = [out / name for name in ("images", "masks", "valid", "work")]
@@ -166,7 +175,11 @@ def require_apart(config: PhotosConfig) -> None:
 
 
 def make(config: PhotosConfig, scene: Path) -> None:
-    """Make the capture and write it: the file `scene` and images. Stages with results in work/ are not repeated."""
+    """Find cameras, masks and flash, and write the capture: the scene file `scene`, photographs and masks beside it.
+
+    Prints reports for the user. Intermediate results are kept in the folder work/. If the command was interrupted,
+    stages whose results are there are not repeated. Raises InputError if a stage fails.
+    """
     pictures = folder.find_pictures(config.folder, upright=detect(config.folder) is None)
     if dark := folder.without_flash(pictures):
         print(f"Flash: did not fire, by EXIF data, in {', '.join(dark)}, which are left out")

@@ -78,7 +78,11 @@ def require_options(config: RenderConfig) -> None:
 
 
 def require_writable(views: list[RenderedView], capture: Capture, config: RenderConfig) -> None:
-    """Raise InputError if the pictures cannot be written, or if they would overwrite each other or photographs."""
+    """Raise InputError if the pictures cannot be written, or if they would overwrite each other or photographs.
+
+    `views`: the pictures to render, with their file names. `capture`: the scene with its photographs. No file is
+    written.
+    """
     if config.film:
         sizes = sorted({view.shot.size for view in views})
         if len(sizes) > 1:

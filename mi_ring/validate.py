@@ -65,9 +65,10 @@ class ValidateConfig:
 
 
 def chosen_photographs(shots: Sequence[Shot], names: Sequence[str]) -> list[int]:
-    """Return the indices of the photographs with these ids or image names; without `names`, of all photographs.
+    """Return the indices of the photographs with these names.
 
-    Raises InputError for a name that no photograph has.
+    If `names` is empty, return the indices of all photographs. A name is the id of a photograph in the scene file, or
+    the name of its image file. Raises InputError for a name that no photograph has.
     """
     for name in names:
         if not any(name in (shot.name, shot.file_name) for shot in shots):
@@ -76,7 +77,10 @@ def chosen_photographs(shots: Sequence[Shot], names: Sequence[str]) -> list[int]
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command. Returns its exit status: 1 if the direct light of the renderers differs."""
+    """Run the command with these arguments of the command line. Returns its exit status.
+
+    It is 1 if the direct light of the two renderers differs by more than Monte Carlo noise, otherwise 0.
+    """
     config = command.parse(ValidateConfig, arguments, "mi_ring.validate")
     path, out = config.scene, Path("out/validate") / command.scene_name(config.scene)
     if path.is_dir():

@@ -1,8 +1,8 @@
 """The calibration that a fit refines: the unknowns of cameras and lights with their values, and the room's light.
 
-The paper refines calibration together with the shape (its Table 3). Room light that is the same from all sides counts
-as fixed in the world. Room light that is fixed in the camera has an effect like a flash elsewhere or another
-reflectance. So it is refined only if the scene has such light.
+The paper refines calibration together with the shape (its Table 3). Room light may be fixed in the axes of the world or
+of the camera. Light from all sides counts as fixed in the world. Light that is fixed in the camera can be confused with
+a flash at another place or with another reflectance. So it is refined only if the scene already has such light.
 """
 
 import math
@@ -37,9 +37,9 @@ ROOM_START = 0.15  #: progress of a fit at which refinement of the room's light 
 
 
 class Calibration(nn.Module):
-    """The unknowns of calibration as trainable parameters. 0 is the capture's value.
+    """The unknowns of calibration as trainable parameters. At 0, an unknown has the value of the capture.
 
-    The unit of each parameter is the standard deviation of its prior.
+    The unit of each parameter is the standard deviation of its Gaussian prior.
     """
 
     def __init__(
@@ -67,59 +67,70 @@ class Calibration(nn.Module):
         self.room = RoomLight(room, rig.exposure, frames, alone)
 
     def value(self, name: str) -> Tensor:
-        """Return the current value of the unknown `name` in its own unit; 0 if it is not refined."""
+        """Return the current value of the unknown `name` in its own unit; 0 if the fit does not refine it."""
         return getattr(self, name) * self.widths[name] if name in self.widths else torch.zeros(())
 
     def estimate(self) -> Estimate:
-        """Apply the current values of all unknowns to the capture's cameras, lights and response."""
+        """Return the capture's cameras, lights and response, changed by the current values of all unknowns."""
         now = self.rig.estimate()
         for name, unknown in self.unknowns.items():
             now = unknown.apply(now, self.value(name), self.rig)
         return now
 
     def forward(self, scale: int = 1) -> Views:
-        """Return the current cameras and lights of all photographs. `scale`: how many times smaller pictures are."""
+        """Return the current cameras and lights of all photographs.
+
+        `scale`: factor by which pictures are reduced. The intrinsics [px] are divided by it.
+        """
         views = self.rig.views_of(self.estimate())
         return views if scale == 1 else views._replace(intrinsics=views.intrinsics / scale)
 
     def lamps(self) -> LightTensors:
-        """Return the lamps of the scene with their current places and strengths."""
+        """Return the scene's own lamps, which light all photographs, with their current places and strengths."""
         return self.rig.lamps_of(self.estimate())
 
     def lamp_tensors(self) -> list[Tensor]:
-        """List [places (L, 3), strengths (L, 3)] of the scene's L lamps; [] if lamps are not refined."""
+        """Return [places, strengths] of the scene's own L lamps, two tensors (L, 3); [] if lamps are not refined.
+
+        A place is a position [scene units], or the unit direction toward a distant lamp.
+        """
         if "lamps" not in self.refined:
             return []
         now = self.lamps()
         return [now.places.to(device()), now.strengths.to(device())]
 
     def solves_room(self, progress: float) -> bool:
-        """Test whether the fit estimates the room's light at this `progress`, 0 to 1.
+        """Test whether the fit estimates the room's light at the current `progress` of the fit, 0 to 1.
 
-        If the room's light is the only one, the fit estimates it from the start. Otherwise it begins at `ROOM_START`.
+        It does so only with `--refine ambient`: from the start if the room's light is the only light, otherwise from
+        progress 0.15 on.
         """
         return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
 
     @torch.no_grad()
     def relight(self, surface: Surface) -> None:
-        """Set the lamps in the scene of `surface` to their current values. Does nothing if lamps are not refined."""
+        """Set the lamps in the scene that contains `surface` to their current values.
+
+        Does nothing if lamps are not refined.
+        """
         if lamps := self.lamp_tensors():
             surface.relight(*map(bridge.to_drjit, lamps))
 
     @property
     def albedo_factor(self) -> float:
-        """Factor of the albedo: with it, a change of the unknown `scale` does not change directly lit surfaces."""
+        """Factor of the albedo that cancels the unknown `scale`, the common factor of all lights, in direct light."""
         return math.exp(-float(self.value("scale").detach()))
 
     @property
     def power_factor(self) -> float:
-        """Common factor of the strengths of all lights, as estimated so far."""
+        """Common factor of the strengths of all lights, relative to the capture, as estimated so far."""
         return self.rig.power / self.albedo_factor
 
     def indirect(self, light: Tensor) -> Tensor:
-        """Attach interreflection `light` (n, H, W, 3) to the unknown `scale`. Returns the same values with a gradient.
+        """Give interreflection a gradient with respect to the unknown `scale`, the common factor of all lights.
 
-        If the lights are stronger, the surface is darker, and each bounce after the first is weaker by this factor.
+        `light` (n, H, W, 3): linear radiance. Returns the same values. If the lights are stronger, the albedo is lower
+        by the same factor. Each bounce after the first is then weaker by this factor.
         """
         scale = self.value("scale").to(light)
         return light * (scale.detach() - scale).exp()
@@ -127,7 +138,7 @@ class Calibration(nn.Module):
     def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
         """Compute the cosine (N, H, W, 1) of the angle between the optical axis and the ray of each pixel.
 
-        `index` (N,): the photographs. `scale`: how many times smaller they are.
+        `index` (N,): indices of the photographs. `scale`: factor by which they are reduced. The result has no gradient.
         """
         width, height = (size // scale for size in self.rig.sizes[index[0]])
         views = self(scale)
@@ -139,45 +150,50 @@ class Calibration(nn.Module):
         return (1 + distance2)[..., None] ** -0.5
 
     def response(self) -> CameraResponse:
-        """Return the camera response with the current values."""
+        """Return the camera response (vignetting, gains and tone curve) with the current values of the unknowns."""
         return self.estimate().response
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Convert scene radiance (N, H, W, 3) to the values that the cameras record, by the current response.
+        """Convert scene radiance (N, H, W, 3) to the values that the cameras record with the current camera response.
 
-        `index` (N,): the photographs. `scale`: how many times smaller they are.
+        `index` (N,): indices of the photographs. `scale`: factor by which the photographs are reduced.
         """
         response = self.response()
         return response.recorded(radiance, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Convert recorded values (N, H, W, 3) to scene radiance: the inverse of `recorded`, without gradients."""
+        """Convert recorded values (N, H, W, 3) to scene radiance with the current camera response, without gradients.
+
+        `index` (N,): indices of the photographs. `scale`: factor by which the photographs are reduced.
+        """
         response = self.response()
         return response.linear(recorded, index, self.cosines(index, scale) if response.has_vignetting else None)
 
     def refined_photographs(self, photographs: Photographs, views: Views) -> Photographs:
-        """Return `photographs`, for the renderer, with other cameras and lights and with the current room light.
+        """Return a copy of `photographs` with other cameras and lights, and with the current room light, for rendering.
 
-        `views`: the cameras and lights of all P photographs. The result has no gradients.
+        `views`: the new cameras and lights of all photographs. The result has no gradients.
         """
         room = self.room_harmonics().double().numpy(force=True)
         return replace(prediction.with_views(photographs, views), room=room if room.any() else None)
 
     def room_harmonics(self) -> Tensor:
-        """Return the current spherical harmonics (BASIS, 3) of the room.
+        """Return the current spherical harmonics (BASIS, 3) of the room's light.
 
-        If they are not refined, they are those of the capture times the factor of all lights, `scale`.
+        If the room's light is not refined, the harmonics of the capture are multiplied by the common factor of all
+        lights.
         """
         harmonics = self.room.harmonics
         return harmonics if "ambient" in self.refined else harmonics / self.albedo_factor
 
     @torch.no_grad()
     def room_share(self, harmonics: Tensor) -> Tensor:
-        """Compare room light, `harmonics` (BASIS, 3), with the photographs' own lights at the object.
+        """Compare the room's light with the photographs' own lights at the object.
 
-        Returns the mean irradiance by the room, divided by the irradiance of a surface that faces the photograph's
-        light (3,). If photographs have no lights of their own, it returns the mean radiance (3,) of the room.
+        Returns a ratio (3,), one for each colour. `harmonics` (BASIS, 3): the room's light. The ratio is the mean
+        irradiance by the room, divided by the irradiance of a surface that faces the photograph's light. If photographs
+        have no lights of their own, the result is the mean radiance (3,) of the room.
         """
         now = self()
         distance2 = torch.where(self.rig.finite, (now.places - self.rig.center).square().sum(-1, keepdim=True), 1.0)
@@ -186,13 +202,16 @@ class Calibration(nn.Module):
         return mean / own if bool((own > 0).all()) else mean / math.pi
 
     def prior(self) -> Tensor:
-        """Compute the loss of the Gaussian priors: half the sum of squares of all unknowns, per photograph."""
+        """Compute the loss of the Gaussian priors: half the sum of squares of all parameters.
+
+        It is divided by the number of photographs.
+        """
         return sum((getattr(self, name).square().sum() for name in self.widths), torch.zeros(())) / 2 / len(self.rig)
 
     def parameters_without_solver(self) -> list[list[Tensor]]:
-        """List the parameters that an optimiser must train, because no solver estimates them.
+        """List the parameters that Adam must train. The other unknowns have solvers, for example for camera poses.
 
-        Returns a list of parameters for each option of `--refine`.
+        Returns a list of lists: the parameters of each option of `--refine`.
         """
         groups: dict[str, list[Tensor]] = {}
         for name, unknown in self.unknowns.items():
@@ -201,9 +220,9 @@ class Calibration(nn.Module):
         return list(groups.values())
 
     def current_and_given(self, option: str) -> list[tuple[Tensor, Tensor]]:
-        """List (current value, value of the capture), two tensors, for each unknown of an `option` of `--refine`.
+        """List (current value, value of the capture) of each unknown that an `option` of `--refine` refines.
 
-        The caller may change the current value in place.
+        Both are tensors in the unit of the parameter. The caller may change the current value in place.
         """
         if option == "ambient":
             return [(self.room.harmonics, self.room.given)]
@@ -212,7 +231,7 @@ class Calibration(nn.Module):
 
     @torch.no_grad()
     def applied(self, capture: Capture) -> Capture:
-        """Return the capture with the current cameras, lights, lamps and camera response."""
+        """Return a copy of `capture` with the current cameras, lights, lamps, room light and camera response."""
         estimate = self.estimate()
         views, lamps = self.rig.views_of(estimate), self.rig.lamps_of(estimate)
         gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))

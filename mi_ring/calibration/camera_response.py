@@ -16,7 +16,7 @@ DARKEST = 1e-4  #: radiance, in units of the exposure, below which the power cur
 class CameraResponse(NamedTuple):
     """The camera response of P photographs: vignetting, gains and a tone curve.
 
-    A field is None if it is not refined.
+    Some fields are known from the capture and constant. The others are refined by the fit, or None if they are not.
     """
 
     exponent: Tensor | None  #: logarithm of the curve's exponent: the decoded value is radiance to this power
@@ -30,30 +30,36 @@ class CameraResponse(NamedTuple):
 
     @property
     def has_vignetting(self) -> bool:
-        """Test whether there is vignetting, known or refined. If so, `recorded` and `linear` need `cosines`."""
+        """True if there is vignetting, known or refined. Methods then need the argument `cosines`."""
         return self.vignetting is not None or bool(self.known_vignetting.any())
 
     def recorded(self, radiance: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """Convert scene radiance (N, ..., 3) to recorded values from which the known response has been removed.
+        """Convert scene radiance (N, ..., 3) to recorded values without the capture's known response.
 
-        Observed photographs have such values. `index` (N,): the photographs. `cosines` (N, ..., 1): cosine of the angle
-        between the ray of a pixel and the optical axis; needed with vignetting.
+        The pixels of an observation are such values. `index` (N,): indices of the photographs. `cosines` (N, ..., 1):
+        cosine of the angle between the ray of a pixel and the optical axis; needed only if there is vignetting.
         """
         known, unknown = self.factors(radiance, index, cosines)
         return self.with_curve(radiance * known * unknown, self.gammas[index]) / known
 
     @torch.no_grad()
     def linear(self, recorded: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None = None) -> Tensor:
-        """Convert recorded values (N, ..., 3) to scene radiance. It is the inverse of `recorded`, without gradients."""
+        """Convert recorded values (N, ..., 3), without the known response, to scene radiance.
+
+        The result has no gradient. `index` (N,): indices of the photographs. `cosines` (N, ..., 1): cosine of the angle
+        between the ray of a pixel and the optical axis; needed only if there is vignetting.
+        """
         known, unknown = self.factors(recorded, index, cosines)
         return self.without_curve(recorded * known, self.gammas[index]) / known / unknown
 
     def factors(
         self, like: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None
     ) -> tuple[Tensor | float, Tensor | float]:
-        """Compute the factors of vignetting times gain: (factors of the capture, refined factors).
+        """Return two factors for each pixel, vignetting times gain: (as the capture knows them, as refined by the fit).
 
-        Each is a tensor (N, ..., 3) in the dtype and on the device of `like`, or 1.0 if there are no such factors.
+        Each is a tensor (N, ..., 3) with the dtype and the device of `like`, a picture (N, ..., 3), or 1.0 if it
+        changes nothing. `index` (N,): indices of the photographs. `cosines` (N, ..., 1): cosine of the angle between
+        the ray of a pixel and the optical axis; None: no vignetting.
         """
         ones = [1] * (like.ndim - 2)
 
@@ -69,7 +75,10 @@ class CameraResponse(NamedTuple):
         return known, unknown
 
     def with_curve(self, radiance: Tensor, gammas: Tensor) -> Tensor:
-        """Apply the refined tone curve to radiance (N, ...). `gammas` (N,): exponents that the capture knows."""
+        """Apply the refined tone curve to radiance (N, ...).
+
+        `gammas` (N,): exponents of the capture's own tone curve, one for each photograph.
+        """
         if self.exponent is not None:
             relative = radiance / self.exposure
             radiance = radiance * relative.clamp(min=DARKEST) ** (self.exponent.exp().to(radiance) - 1)
@@ -77,7 +86,10 @@ class CameraResponse(NamedTuple):
 
     @torch.no_grad()
     def without_curve(self, recorded: Tensor, gammas: Tensor) -> Tensor:
-        """Undo the refined tone curve in recorded values (N, ...). It is the inverse of `with_curve`."""
+        """Remove the refined tone curve from recorded values (N, ...), without gradients. Returns radiance (N, ...).
+
+        `gammas` (N,): exponents of the capture's own tone curve, one for each photograph.
+        """
         if self.contrast is not None:
             recorded = with_contrast(recorded, (-self.contrast).exp(), gammas)
         if self.exponent is None:
@@ -87,9 +99,10 @@ class CameraResponse(NamedTuple):
 
 
 def with_contrast(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
-    """Apply an S-curve of steepness `contrast` to values (N, ...) that were decoded with the exponents `gammas` (N,).
+    """Apply an S-curve of steepness `contrast` to decoded values (N, ...). Steepness 1 changes nothing.
 
-    Two S-curves in a row are one S-curve whose steepness is the product. So the capture's contrast is not needed here.
+    `gammas` (N,): exponents with which the values were decoded. Two S-curves one after the other are one S-curve, whose
+    steepness is the product. So the capture's own contrast is not needed here.
     """
     gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
     lit = values.clamp(min=BLACK)  # below it the curve is a straight line

@@ -12,7 +12,11 @@ from mi_ring.scene.lights import Light
 
 
 class LightTensors(NamedTuple):
-    """L point lights or distant lights as tensors."""
+    """L point lights or distant lights as tensors.
+
+    `places` (L, 3): positions [scene units] of point lights, unit directions toward distant ones. `finite` (L, 1): True
+    for a point light. `strengths` (L, 3): intensities of point lights, irradiances of distant ones.
+    """
 
     places: Tensor  #: (L, 3) positions [scene units], of distant lights unit directions toward them
     finite: Tensor  #: (L, 1) bool: a point light? Else it is distant
@@ -28,15 +32,16 @@ class LightTensors(NamedTuple):
         return cls(at, torch.tensor(finite, dtype=torch.bool)[:, None], rgb)
 
     def moved(self, offset: Tensor, distance: float) -> "LightTensors":
-        """Return the lights, moved by `offset` (L, 3). The unit of `offset` is `distance` [scene units].
+        """Return a copy with moved lights.
 
-        Directions of distant lights are turned instead; the unit of `offset` is then the radian.
+        `offset` (L, 3): the motion of each light, in multiples of `distance` [scene units]. A distant light is turned
+        instead: `offset` is then added to its unit direction, and its unit is the radian.
         """
         moved = self.places + offset * torch.where(self.finite, distance, 1.0)
         return self._replace(places=torch.where(self.finite, moved, F.normalize(moved, dim=-1)))
 
     def lights(self) -> list[Light]:
-        """Convert the tensors to lights."""
+        """Convert the tensors to a list of L lights."""
         places, strengths = (part.detach().double().numpy(force=True) for part in (self.places, self.strengths))
         return [Light("point", place, rgb) if point else Light("directional", -place, rgb)
                 for place, point, rgb in zip(places, self.finite[:, 0].tolist(), strengths)]  # fmt: skip

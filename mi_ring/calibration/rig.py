@@ -1,4 +1,4 @@
-"""The rig: cameras and lights as a capture gives them, as tensors, and estimates that differ from them."""
+"""The rig: cameras and lights of a capture as constant tensors; and estimates, which the unknowns of a fit change."""
 
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,7 @@ INSIDE = 0.999  #: share of the range in which a lens distortion can be inverted
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated cameras, lights and camera response: those of the capture, changed by each unknown in turn."""
+    """Estimated cameras, lights and camera response: those of the capture, after each unknown has changed them."""
 
     views: Views  #: lights as in the capture
     offset: Tensor  #: (light places, 3) or (): of the lights [rig's distance], of distant ones [rad]
@@ -30,15 +30,15 @@ class Estimate:
     response: CameraResponse
 
     def seen(self, **views: Tensor) -> "Estimate":
-        """Return a copy in which the tensors given by name replace those of `views`."""
+        """Return a copy with other cameras. `views`: new tensors by name of the field, for example `distortion=…`."""
         return replace(self, views=self.views._replace(**views))
 
 
 class Rig:
     """Cameras and lights as the capture gives them, as tensors that stay constant during a fit.
 
-    Photographs with equal focal lengths and distortion share a `lens`. Photographs with the same light position share a
-    `place`. A flash that moves with the camera has one place for all photographs, in camera coordinates.
+    Photographs with equal focal lengths and distortion share a lens. Photographs with the same light position share the
+    place of a light. A flash that moves with the camera has one place for all photographs, in camera coordinates.
     """
 
     def __init__(
@@ -97,18 +97,24 @@ class Rig:
         return len(self.lens)
 
     def count(self, per: str) -> int:
-        """Return how many there are of `per`: "photograph", "lens", "light" or "lamp"."""
+        """Return the number of photographs, lenses, places of lights, or lamps in the scene.
+
+        `per`: "photograph", "lens", "light" or "lamp".
+        """
         several = {"photograph": len(self), "lens": int(self.lens.max()) + 1, "light": int(self.place.max()) + 1,
                    "lamp": len(self.lamps.places)}  # fmt: skip
         return several[per]
 
     def estimate(self) -> Estimate:
-        """Return the estimate that equals the capture. The unknowns then change it."""
+        """Return an estimate that equals the capture: no offset of a light, and all factors 1."""
         none = torch.zeros(())
         return Estimate(self.views, none, none, none, none, self.response)
 
     def views_of(self, estimate: Estimate) -> Views:
-        """Return the cameras and lights of an estimate. Its offsets move the lights, its factors scale them."""
+        """Return the cameras and lights of an estimate. Its offsets move the lights, its factors scale their strengths.
+
+        Distortions are clipped to the range in which each ray has exactly one pixel.
+        """
         now = estimate.views
         offset = (self.free * estimate.offset).expand(self.count("light"), 3)[self.place]
         if self.flash is not None:
@@ -124,6 +130,6 @@ class Rig:
         return now._replace(places=places, strengths=now.strengths * estimate.log_power.exp(), distortion=distortion)
 
     def lamps_of(self, estimate: Estimate) -> LightTensors:
-        """Return the scene's lamps, moved by the offsets and scaled by the factors of an estimate."""
+        """Return the scene's own lamps, moved by the offsets of an estimate, with strengths scaled by its factors."""
         strengths = self.power * estimate.log_lamp_power.exp() * self.lamps.strengths
         return self.lamps._replace(strengths=strengths).moved(estimate.lamp_offset, self.distance)

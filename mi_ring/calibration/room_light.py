@@ -45,7 +45,7 @@ class RoomLight(nn.Module):
         self.register_buffer("vector", torch.zeros(3, BASIS))
 
     def forget(self) -> None:
-        """Empty the normal equations. The harmonics do not change."""
+        """Set the normal equations to 0, so that earlier photographs no longer count. The harmonics do not change."""
         self.matrix.zero_()
         self.vector.zero_()
 
@@ -56,9 +56,11 @@ class RoomLight(nn.Module):
     ) -> None:  # fmt: skip
         """Add photographs to the normal equations, solve them, and set the harmonics to the solution.
 
-        `around`: the light of each harmonic in the photographs. `predicted`, `observed` (N, H, W, 3): linear radiance;
-        the prediction contains the current room light without occlusion. `counted` (N, H, W) bool: pixels that show the
-        object. `progress`: progress of the fit, 0 to 1. `total`: a function that sums a tensor over all processes.
+        `around`: rendered pictures, one for the light of each spherical harmonic. `predicted`, `observed` (N, H, W, 3):
+        linear radiance. `predicted` must contain the current room light without occlusion. `counted` (N, H, W) bool:
+        True where a pixel shows only the object. `progress` of the fit, 0 to 1: a room without other light has its
+        finest harmonics only later in the fit. `total`: returns the sum of a tensor over all processes; default: one
+        process.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:

@@ -1,12 +1,12 @@
 """The unknowns of calibration: cameras, lenses, lights and the camera's response. Each unknown has a class.
 
 A new unknown is a class here with an entry in `UNKNOWNS`. The unit of its parameters is the standard deviation of its
-prior. At 0 the unknown has the value of the capture.
+prior. At 0 the unknown has the value of the capture. The unit of length, the distance, is the median distance from the
+cameras to the object.
 
-Photographs do not determine some combinations of unknowns; the priors determine them. These are: the brightness of the
-lights and the albedo (so the logarithms of `power` and `gain` have mean zero in each colour, and `scale` also changes
-the albedo); position, rotation and scale of the whole scene; focal length and distance; almost also the cone of a flash
-and vignetting, if the flash is beside the lens.
+Only the priors determine some combinations of unknowns. These are: the brightness of the lights and the albedo (so the
+logarithms of `power` and `gain` have mean zero in each colour, and `scale` also changes the albedo); position, rotation
+and scale of the whole scene; focal length and distance; almost also a flash's cone and vignetting.
 """
 
 from abc import ABC, abstractmethod
@@ -27,7 +27,7 @@ VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measu
 
 
 class Found(NamedTuple):
-    """The capture before and after a fit, and other values that `Unknown.describe` needs."""
+    """The capture before and after a fit, and other values from which unknowns describe their results."""
 
     rig: Rig
     before: Capture  #: as the capture says
@@ -37,7 +37,7 @@ class Found(NamedTuple):
     several: bool  #: Are the photographs' lights the first of several unknown lamps?
 
     def means(self, of: Callable[[Shot], float]) -> tuple[float, float]:
-        """Compute the mean of the number `of(shot)` over all photographs: (before the fit, after the fit)."""
+        """Return the mean of the number `of(shot)` over all photographs: (before the fit, after the fit)."""
         before, after = (float(np.mean([of(shot) for shot in side.shots])) for side in (self.before, self.after))
         return before, after
 
@@ -46,7 +46,7 @@ class Found(NamedTuple):
 class Unknown(ABC):
     """Base class of the unknowns of calibration.
 
-    An unknown has `components` numbers for each photograph, lens, light or lamp, or for the capture, as `per` says.
+    It has `components` numbers per photograph, lens, light or lamp, or for the whole capture; `per` says which.
     """
 
     name: str
@@ -76,8 +76,8 @@ class Unknown(ABC):
     def rows(self, rig: Rig, index: np.ndarray) -> list[np.ndarray]:
         """Find the rows of the parameter that affect the photographs `index` (n,).
 
-        Returns a list of arrays (n,) with one row number per photograph. The list has one array per lamp for an unknown
-        of lamps, because all lamps light every photograph. For all other unknowns it has one array.
+        Returns a list of arrays (n,), each with one row number per photograph. For an unknown of lamps, the list has
+        one array for each lamp, because all lamps light every photograph. For all other unknowns it has one array.
         """
         if self.per == "lamp":  # all lamps light all photographs
             return [np.full_like(index, k) for k in range(rig.count("lamp"))]
@@ -93,22 +93,22 @@ class Unknown(ABC):
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any] | None:
         """Describe the result of the fit: (meaning in words, value before the fit, value after, standard deviation).
 
-        Returns None if the unknown belongs to single photographs. `value`, `std`: value and standard deviation of the
-        parameter, in the unknown's own unit.
+        Returns None if each photograph has its own value. `value`, `std`: final value and standard deviation, in the
+        unknown's own unit.
         """
         return None
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any] | None:
         """Describe the result for one photograph: (key in calibration.json, value, standard deviation).
 
-        Returns None if photographs share the unknown. `value`, `std`: value and standard deviation for this photograph,
-        in the unknown's own unit.
+        Returns None if photographs share the unknown. `value`, `std`: final value and standard deviation for this
+        photograph, in the unknown's own unit.
         """
         return None
 
 
 class Turn(Unknown):
-    """Rotation of each camera about its own axes [rad]."""
+    """Rotation of each camera about its own axes: a rotation vector [rad]."""
 
     solved = True
 
@@ -122,7 +122,7 @@ class Turn(Unknown):
 
 
 class Move(Unknown):
-    """Translation of each camera along its own axes [`Rig.distance`]."""
+    """Translation of each camera along its own axes. The unit is the median distance from cameras to object."""
 
     solved = True
 
@@ -173,7 +173,7 @@ class Distortion(Unknown):
 
 
 class LightPlace(Unknown):
-    """Offset of each light's position [`Rig.distance`]. For a distant light: offset of its direction [rad]."""
+    """Offset of each light's position [median distance of cameras and object]; of a distant light's direction [rad]."""
 
     def width_for(self, rig: Rig) -> float:
         return self.width * (VAGUE if rig.guessed else 1.0)
@@ -205,7 +205,7 @@ class Exposure(Unknown):
 
 
 class Power(Exposure):
-    """Logarithm of a factor of each photograph's light, for each colour channel."""
+    """Logarithm of a factor of the strength of each photograph's own light, for each colour channel."""
 
     changes = "light"
 
@@ -214,7 +214,7 @@ class Power(Exposure):
 
 
 class Falloff(Unknown):
-    """Correction that is added to the cosine exponent of the flash's cone."""
+    """Correction that is added to the cosine exponent of the flash's cone. It makes the flash darker off its axis."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return now.seen(falloff=now.views.falloff + value)
@@ -224,7 +224,7 @@ class Falloff(Unknown):
 
 
 class Vignetting(Unknown):
-    """Correction that is added to the cosine exponent of the lens's vignetting."""
+    """Correction that is added to the cosine exponent of vignetting, which darkens the corners of photographs."""
 
     changes = "recording"
 
@@ -236,7 +236,7 @@ class Vignetting(Unknown):
 
 
 class CurveExponent(Unknown):
-    """Logarithm of the exponent of the camera's tone curve."""
+    """Logarithm of the exponent of the camera's tone curve. One number for all photographs."""
 
     changes = "recording"
 
@@ -249,7 +249,7 @@ class CurveExponent(Unknown):
 
 
 class Contrast(Unknown):
-    """Logarithm of the steepness of the S in the camera's tone curve."""
+    """Logarithm of the steepness of the S-curve in the camera's tone curve. One number for all photographs."""
 
     changes = "recording"
 
@@ -262,7 +262,7 @@ class Contrast(Unknown):
 
 
 class Gain(Exposure):
-    """Logarithm of a factor of all values of a photograph, for each colour channel. It has no gradient."""
+    """Logarithm of a factor of all values of a photograph, for each colour channel. Gradients ignore it."""
 
     changes = "gain"
 
@@ -287,7 +287,7 @@ class Scale(Unknown):
 
 
 class LampPlace(LightPlace):
-    """Offset of each lamp of the scene, in the units of `LightPlace`."""
+    """Offset of each lamp's position [median distance of cameras and object]; of a distant lamp's direction [rad]."""
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return replace(now, lamp_offset=value)
@@ -338,13 +338,13 @@ OWN_LIGHTS = {unknown.option for unknown in UNKNOWNS.values() if unknown.own_lig
 
 
 def centred(value: Tensor, rig: Rig) -> Tensor:
-    """Subtract the mean over the fitted photographs from log factors `value` (P, 3). Held-out photographs get 0."""
+    """Subtract from log factors (P, 3) their mean over the fitted photographs. Returns 0 for held-out photographs."""
     result = torch.zeros_like(value)
     result[rig.fitted] = value[rig.fitted] - value[rig.fitted].mean(0)
     return result
 
 
 def lens_cameras(found: Found) -> Iterable[list]:
-    """Yield two lists: for each lens, the camera of its first photograph, before the fit and after the fit."""
+    """Yield two lists of cameras: before the fit and after the fit. Each has one camera for each lens."""
     first = np.unique(found.rig.lens.numpy(), return_index=True)[1]
     return ([side.shots[k].whole.camera for k in first] for side in (found.before, found.after))

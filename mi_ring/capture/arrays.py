@@ -28,9 +28,9 @@ Item = TypeVar("Item")
 
 
 def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarray]:
-    """Check photographs, and return them as arrays (H, W, 3).
+    """Check photographs, and return them as arrays (H, W, 3) of their type: uint8, uint16 or float32.
 
-    Raises InputError if there are none, or if one is invalid.
+    `encoding`: "auto", "srgb" or "linear". Raises InputError if there are no photographs, or if one is invalid.
     """
     if encoding not in ("auto", "srgb", "linear"):
         raise InputError(f"encoding: is {encoding!r}, must be one of auto, srgb, linear")
@@ -41,9 +41,10 @@ def images_of(images: Iterable[ArrayLike], encoding: Encoding) -> list[np.ndarra
 
 
 def masks_of(masks: Iterable[ArrayLike | None] | None, images: Sequence[np.ndarray], what: str) -> Pixels:
-    """Check the masks of `images`, and return them as uint8 arrays (H, W), 255 on the object.
+    """Check masks, and return them as uint8 arrays (H, W), 255 on the object. A photograph without a mask has None.
 
-    Raises InputError if a mask is invalid. The message begins with `what`.
+    `masks`: one (H, W) bool or uint8, or None, for each of the `images`; None: no photograph has a mask. Raises
+    InputError if a mask is invalid. The message begins with `what`.
     """
     several = zip(one_each(masks, len(images), what), images)
     return Pixels.of([mask_of(mask, image, f"{what}[{k}]") for k, (mask, image) in enumerate(several)])
@@ -53,9 +54,12 @@ def shots_of(
     images: Sequence[np.ndarray], cameras: Iterable[Camera], lights: Iterable[Light | None] | None,
     names: Sequence[str] | None, encoding: Encoding, saturation: float, calibrated: bool,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """Make a `Shot` for each image. The arguments are those of `Capture.from_arrays`.
+    """Check cameras, lights and names, and make a `Shot` of each photograph. The result does not contain pixels.
 
-    Raises InputError if an argument is invalid.
+    `images`: N checked arrays (H, W, 3). `cameras`: N cameras. `lights`: N lights; None for a light at the camera.
+    `names`: N names; None for 000, 001, …. `encoding`: "auto", "srgb" or "linear". `saturation`: encoded value (1 =
+    full scale) from which a pixel is clipped. `calibrated`: True if cameras and lights are exact. Raises InputError if
+    an argument is invalid.
     """
     count = len(images)
     full = float(require_numbers(saturation, (), "saturation"))
@@ -70,7 +74,10 @@ def shots_of(
 
 
 def listed(items: Iterable[Item], what: str) -> list[Item]:
-    """Return the items as a list. Raises InputError, which begins with `what`, if they are none."""
+    """Convert `items`, for example a tuple or a generator, to a list. Raises InputError if they cannot be iterated.
+
+    The message begins with `what`, the name of the argument.
+    """
     try:
         return list(items)
     except TypeError:
@@ -78,7 +85,11 @@ def listed(items: Iterable[Item], what: str) -> list[Item]:
 
 
 def array_of(value: ArrayLike, what: str) -> np.ndarray:
-    """Return an array of any type and shape. Raises InputError, which begins with `what`, if rows differ in length."""
+    """Convert a value to an array of any type and shape.
+
+    Raises InputError if the rows of a nested list differ in length. The message begins with `what`, the name of the
+    argument.
+    """
     try:
         return np.asarray(value)
     except ValueError as error:
@@ -86,9 +97,9 @@ def array_of(value: ArrayLike, what: str) -> np.ndarray:
 
 
 def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item | None]:
-    """Return `items` as a list, one for each photograph. If `items` is None, all items of the list are None.
+    """Return `items` as a list with one item for each of `count` photographs. If `items` is None, each item is None.
 
-    Raises InputError if there are not `count` items. The message begins with `what`.
+    Raises InputError if the number of items is not `count`. The message begins with `what`, the name of the argument.
     """
     found: list[Item | None] = [None] * count if items is None else listed(items, what)
     if len(found) != count:
@@ -99,7 +110,8 @@ def one_each(items: Iterable[Item] | None, count: int, what: str) -> list[Item |
 def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
     """Check a photograph, and return it as an array (H, W, 3).
 
-    Raises InputError if it is invalid. The message begins with `what`.
+    `encoding`: "auto", "srgb" or "linear". Raises InputError if the type, the shape or the values are invalid. The
+    message begins with `what`, the name of the argument.
     """
     array = array_of(image, what)
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 3 or array.shape[2] != 3 or not array.size:
@@ -115,9 +127,10 @@ def image_of(image: ArrayLike, encoding: Encoding, what: str) -> np.ndarray:
 
 
 def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray | None:
-    """Check a mask, and return it as an array (H, W) uint8, 255 on the object. If `mask` is None, return None.
+    """Check a mask (H, W) bool or uint8, and return it as uint8, 255 on the object. If `mask` is None, return None.
 
-    Raises InputError if the mask is invalid, or if its size is not that of `image`. The message begins with `what`.
+    `image`: the photograph of the mask. Raises InputError if the mask is invalid, or if it has another size than
+    `image`. The message begins with `what`, the name of the argument.
     """
     if mask is None:
         return None
@@ -132,9 +145,9 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
 
 
 def camera_of(camera: Camera | None, image: np.ndarray, what: str) -> Camera:
-    """Check the camera of an image. Returns the camera with its numbers rounded to float32.
+    """Check the camera of the photograph `image`. Returns the camera with its numbers rounded to float32.
 
-    Raises InputError if the camera is invalid, or if its size is not that of the image. The message begins with `what`.
+    Raises InputError if the camera is invalid, or if it has another size than `image`. The message begins with `what`.
     """
     own, size = usable_camera(camera, what), (image.shape[1], image.shape[0])
     if own.size != size:
@@ -145,7 +158,7 @@ def camera_of(camera: Camera | None, image: np.ndarray, what: str) -> Camera:
 def names_of(names: Sequence[str] | None, count: int) -> list[str]:
     """Check the names of `count` photographs, and return them. If `names` is None, return 000, 001, ….
 
-    Raises InputError if a name is invalid or occurs twice.
+    Raises InputError if a name occurs twice, is "object", or cannot be the name of a file.
     """
     if names is None:
         return [f"{k:0{max(3, len(str(count - 1)))}}" for k in range(count)]
@@ -159,9 +172,9 @@ def names_of(names: Sequence[str] | None, count: int) -> list[str]:
 
 
 def room_of(room: ArrayLike) -> np.ndarray:
-    """Return the spherical harmonics (n, 3) of a room's light as an array (BASIS, 3). Missing rows are 0.
+    """Extend the spherical harmonics (n, 3) of a room's light to BASIS rows, with zeros. Returns (BASIS, 3).
 
-    Raises InputError if n is not (order + 1)² for an order up to `MAX_ORDER`.
+    Raises InputError if n is none of 1, 4, 9, 16, 25, or if a number is not finite.
     """
     array, counts = array_of(room, "room"), [(order + 1) ** 2 for order in range(MAX_ORDER + 1)]
     if array.ndim != 2 or array.shape[0] not in counts:
@@ -176,10 +189,10 @@ def sides(image: np.ndarray) -> str:
 
 
 def files_of(shot: Shot, image: np.ndarray, masked: bool, valid: bool) -> Files:
-    """Return the names of the files of a photograph and its masks, relative to the scene file. No file is written.
+    """Return names for the files of a photograph and its masks, relative to the scene file. No file is written.
 
-    An image of float32 gets the suffix exr, everything else png. `masked`: does the photograph have a mask? `valid`:
-    does it have a mask of valid pixels?
+    A float32 `image` gets the suffix exr, any other png. `masked`: True if the photograph has a mask. `valid`: True if
+    it has a mask of valid pixels.
     """
     suffix = "exr" if image.dtype == np.float32 else "png"
     mask, shown = (Path(folder, f"{shot.name}.png") if there else None
@@ -191,9 +204,11 @@ def scene_xml(
     shots: Sequence[Shot], files: Sequence[Files], center: ArrayLike | None, radius: float | None,
     room: ArrayLike | None,
 ) -> bytes:  # fmt: skip
-    """Return the content of the scene file for a capture from arrays. `files`: names relative to the scene file.
+    """Return the content of a new scene file for photographs from arrays. No file is written.
 
-    The other arguments are those of `Capture.from_arrays`. Raises InputError if one is invalid.
+    `files`: names of the files of each photograph, relative to the scene file. `center` (3,), `radius`: sphere around
+    the object [scene units]; None: unknown. `room` (n, 3): spherical harmonics of the room's light; None: dark. Raises
+    InputError if one of these is invalid.
     """
     middle = None if center is None else require_numbers(center, (3,), "center")
     reach = None if radius is None else float(require_numbers(radius, (), "radius"))
@@ -206,7 +221,7 @@ def scene_xml(
 
 
 def write_array(array: np.ndarray, file: Path) -> None:
-    """Write a photograph (H, W, 3) or a mask (H, W) to `file`. If the folder does not exist, it is created.
+    """Write a photograph (H, W, 3) or a mask (H, W) to `file`, a .png or .exr file. Missing folders are created.
 
     Raises InputError if this fails.
     """

@@ -14,10 +14,11 @@ from mi_ring.images import box_filter
 
 
 def with_masks_by_brightness(capture: Capture) -> Capture:
-    """Return the capture with new masks: all pixels brighter than `dark_threshold`. They replace the old masks.
+    """Return a copy of the capture with new masks, which contain the bright pixels of each photograph.
 
-    If the room was lit, the same capture is returned. A mask contains only the lit part of the object, because its
-    shadowed part may be as dark as the room. A photograph in which no light reaches the object gets no mask.
+    Pixels above a threshold are bright. One threshold is estimated from all photographs together. If the room was lit,
+    `capture` itself is returned. A mask contains only the lit part of the object, because the rest may be as dark as
+    the room. A photograph in which no light reaches the object gets no mask.
     """
     threshold = dark_threshold(capture)
     if threshold is None:
@@ -30,7 +31,10 @@ def with_masks_by_brightness(capture: Capture) -> Capture:
 
 
 def dark_threshold(capture: Capture) -> float | None:
-    """Estimate the radiance below which a pixel may show the dark room. Returns None if the room was lit."""
+    """Estimate the radiance below which a pixel may show the dark room. Returns None if the room was lit.
+
+    The unit is full scale of the photographs' files.
+    """
     some = [small_brightness(capture, k) for k in capture.spread(50)]
     values = np.concatenate([image.ravel() for image in some])
     if values.max() <= 0:
@@ -48,18 +52,18 @@ def dark_threshold(capture: Capture) -> float | None:
 
 
 def bright(capture: Capture, k: int, threshold: float) -> np.ndarray:
-    """Return a mask (H, W) uint8 of photograph `k`: 255 where it is brighter than `threshold`, else 0.
+    """Make a mask (H, W) uint8 of photograph `k`: 255 where its radiance is above `threshold`, else 0.
 
-    Connected components are left out if they are smaller than 1 % of the largest one.
+    Connected components that are smaller than 1 % of the largest one are left out.
     """
     labels, sizes = pieces(brightness(capture, k) > threshold)
     return np.where(sizes[labels] > 0.01 * sizes.max(), 255, 0).astype(np.uint8)
 
 
 def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the connected components of a mask (...) bool. Returns (labels (...), number of pixels by label).
+    """Find the connected components of a boolean mask. Returns (labels in the shape of the mask, pixels per label).
 
-    Label 0 is the background. Its number of pixels is set to 0.
+    Label 0 is the background. It counts as 0 pixels.
     """
     labels, _ = scipy.ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
@@ -68,9 +72,10 @@ def pieces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_brightness(capture: Capture, k: int) -> np.ndarray:
-    """Return `brightness` of photograph `k`, reduced by block means. The shorter side keeps at least 256 pixels.
+    """Return the brightness (h, w) of photograph `k`, averaged over square blocks.
 
-    A smaller photograph is not reduced.
+    The shorter side keeps 256 pixels or more. Brightness is the largest linear radiance of the three colour channels. A
+    smaller photograph is not reduced.
     """
     image = torch.from_numpy(brightness(capture, k))[..., None]
     return box_filter(image, max(1, min(image.shape[:2]) // 256))[..., 0].numpy()

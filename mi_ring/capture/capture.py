@@ -36,7 +36,7 @@ LIT = 0.01  #: a room is lit if the background is brighter than this [brightness
 
 
 def require_variant(what: str | Path) -> None:
-    """Raise InputError if the current Mitsuba variant cannot be used for fits. The message begins with `what`."""
+    """Raise InputError unless Mitsuba's variant is llvm_ad_rgb or cuda_ad_rgb. The message begins with `what`."""
     if mi.variant() not in ("llvm_ad_rgb", "cuda_ad_rgb"):
         why = llvm.missing() or "call mi.set_variant('llvm_ad_rgb') first"
         raise InputError(f"{what}: needs the variant llvm_ad_rgb or cuda_ad_rgb of Mitsuba, not {mi.variant()}; {why}")
@@ -96,7 +96,7 @@ class Capture:
         25. `calibrated`: True says that cameras and lights are exact. `name`: name of the capture, for error messages
         and reports.
 
-        A scene file can say more about a photograph. For this, change fields of its `Shot`, and `replace` the `shots`.
+        A scene file can say more about a photograph. To say it here, replace the `shots` by changed ones.
 
         Raises InputError if the input cannot be fitted. The message names the argument.
         """
@@ -123,8 +123,8 @@ class Capture:
     def save(self, path: str | Path) -> "Capture":
         """Write a capture from arrays as the scene file `path`. Its photographs and masks are written beside it.
 
-        Returns a capture that refers to these files. Raises InputError if they cannot be written, or if the capture
-        already has a scene file.
+        Returns a copy of the capture that refers to these files. Raises InputError if they cannot be written, or if
+        this capture already has a scene file.
         """
         path = Path(path)
         if not self.in_memory:
@@ -144,7 +144,7 @@ class Capture:
 
     @functools.cached_property
     def photographs(self) -> Photographs:
-        """Cameras, lights and room light of all photographs, as the renderer takes them.
+        """Cameras, lights and room light of all photographs, in the form that the renderer takes.
 
         Raises SceneError if a light is not supported.
         """
@@ -152,13 +152,13 @@ class Capture:
 
     @functools.cached_property
     def sizes(self) -> dict[tuple[int, int], np.ndarray]:
-        """Indices of the photographs by image size (width, height) [px]. One launch renders photographs of one size."""
+        """Dict from image size (width, height) [px] to the indices of the photographs of this size."""
         sizes = [shot.size for shot in self.shots]
         return {size: np.array([k for k, other in enumerate(sizes) if other == size]) for size in dict.fromkeys(sizes)}
 
     @property
     def known(self) -> bool:
-        """True if the scene says that all cameras and lights are exact."""
+        """True if the scene says of every photograph that its camera and light are exact."""
         return all(shot.calibrated for shot in self.shots)
 
     def __len__(self) -> int:
@@ -166,7 +166,7 @@ class Capture:
 
     @functools.cached_property
     def names(self) -> list[str]:
-        """File name of each photograph. If two have the same file name, all names contain folders."""
+        """File name of each photograph. If two photographs have the same file name, all names also contain folders."""
         files = [Path(os.path.abspath(shot.files.filename or shot.name)) for shot in self.shots]
         names = [file.name for file in files]
         if len(set(names)) == len(names):
@@ -183,7 +183,7 @@ class Capture:
         return replace(self, shots=tuple(self.shots[k] for k in index), **pixels)
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Capture":
-        """Return a capture with transformed cameras and lights: x ↦ scale · rotation (3, 3) x + shift (3,).
+        """Return a copy with transformed cameras and photographs' lights: x ↦ scale · rotation (3, 3) x + shift (3,).
 
         Use it for small motions only, because the rest of the scene (room light, table, lamps) does not move.
         """
@@ -194,35 +194,35 @@ class Capture:
         return evenly_spaced(len(self), most)
 
     def together(self, index: Sequence[int] | np.ndarray, most: int = 8) -> Iterator[np.ndarray]:
-        """Split `index` into groups of photographs of one size, at most `most` each. Yields the indices of a group."""
+        """Split the photographs `index` into groups of one size, each of at most `most`. Yields their indices."""
         for alike in self.sizes.values():
             chosen = np.intersect1d(alike, index)
             for start in range(0, len(chosen), most):
                 yield chosen[start : start + most]
 
     def photograph(self, k: int, scale: int = 1) -> Photographs:
-        """Return camera and lights of photograph `k` for the renderer, at 1 / `scale` of its size."""
+        """Return camera and lights of photograph `k`, for rendering. Width and height are divided by `scale`."""
         return self.selected([k], scale)
 
     def selected(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Photographs:
-        """Return cameras and lights of the photographs `index` for the renderer. The photographs must be of one size.
+        """Return cameras and lights of the photographs `index`, all of one size, for rendering.
 
-        They will be rendered at 1 / `scale` of this size.
+        Width and height are divided by `scale`.
         """
         return self.photographs.select(index, self.shots[index[0]].size, scale)
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
-        """Read the pixels of the photographs `index`, all of one size, reduced by the factor `scale` (box filter)."""
+        """Read the photographs `index`, all of one size, and average blocks of `scale` × `scale` pixels."""
         return Observation.joined([self._observed.get(k, scale, partial(self._observe, k, scale)) for k in index])
 
     def _observe(self, k: int, scale: int) -> Observation:
         return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
     def exposure(self) -> float:
-        """Return the mean linear radiance of the object's pixels, estimated from `SOME` photographs.
+        """Estimate the mean linear radiance of the object's pixels (1 = full scale of the files) from some photographs.
 
-        Without a mask, these are the pixels above 2 % of the photograph's maximum. Raises InputError if all of them are
-        black.
+        In a photograph without a mask, these are the pixels above 2 % of its maximum. Raises InputError if all of them
+        are black.
         """
         total, count = 0.0, 0
         for k in self.spread(SOME):
@@ -236,7 +236,7 @@ class Capture:
 
     @functools.cached_property
     def lit_room(self) -> bool:
-        """True if pixels outside the masks are lit. In a dark room, black pixels show that the object is not there."""
+        """True if pixels outside the masks are lit. In a dark room, the background is black."""
         shares = []
         for k in self.spread(SOME):
             rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.shots[k].size) // COARSE))
@@ -248,24 +248,24 @@ class Capture:
         return bool(shares) and float(np.median(shares)) > LIT
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
-        """Estimate the reflectance, radiance / irradiance, of a surface at `center` (3,).
+        """Estimate the reflectance, radiance / irradiance [1/sr], of the object at `center` (3,) [scene units].
 
-        `exposure`: mean radiance of the surface. If no known light reaches it, returns ALBEDO / π.
+        `exposure`: mean radiance of the object. If no known light reaches it, the albedo is assumed to be 0.5.
         """
         received = float(np.median(self.photographs.irradiance(center).mean(1)))
         return exposure / received if received > 0 else ALBEDO / math.pi
 
     @property
     def up(self) -> np.ndarray:
-        """Mean up direction (3,) of the cameras, of length 1. If the mean is near 0: that of the first camera."""
+        """Mean up direction (3,) of the cameras, of length 1; that of the first camera if the mean is near 0."""
         ups = np.stack([shot.camera.up for shot in self.shots])
         up = ups.mean(0) if np.linalg.norm(ups.mean(0)) > 0.1 else ups[0]
         return up / np.linalg.norm(up)
 
     def silhouettes(self, most: int | None = None) -> list[Silhouette]:
-        """Return the masks of the photographs with their cameras, reduced in size. Equal pairs occur once.
+        """Return the masks of the photographs with their cameras, reduced in size. Equal pairs of both occur once.
 
-        `most`: largest number of them, evenly spaced. None: all.
+        `most`: largest number of silhouettes, which are then evenly spaced. None: all.
         """
         return [
             small_silhouette(Silhouette(
@@ -285,12 +285,12 @@ class Capture:
 
     @property
     def views(self) -> list[MaskedCamera]:
-        """Camera of each photograph, with the mask of valid pixels, both reduced in size."""
+        """Camera of each photograph, with its mask of valid pixels (None: all are valid). Both are reduced in size."""
         return views_of(self.shots, self.valid)
 
     @property
     def hull(self) -> Hull | None:
-        """Visual hull of the masks. It is None if there are no masks, or if all show the object from one side."""
+        """Visual hull of the masks. It is None if there are no masks, or if all cameras look from one side."""
         index, wrong = self._outlined(MAX_MASKS), 0.02 if self.whole else 0.25
         key = wrong, *((self.masks.readers[k], self.valid.readers[k], self.shots[k].camera.key) for k in index)
         if key not in self.hulls:
@@ -302,7 +302,7 @@ class Capture:
 
     @property
     def whole(self) -> bool:
-        """True if the masks contain the whole object. Masks by brightness may lack the part in shadow."""
+        """True if the masks contain the whole object. Masks from brightness may lack the object's shadowed side."""
         return self.threshold is None or (self.photographs.colocated and not self.photographs.dark)
 
     def outline(self, k: int) -> str:
@@ -310,7 +310,7 @@ class Capture:
         return str(self.shots[k].files.mask or self.shots[k].files.filename or self.shots[k].name)
 
     def sphere(self) -> tuple[np.ndarray, float]:
-        """Return (centre (3,), radius) of the normalising sphere [scene units]: from the scene file, else estimated."""
+        """Return (centre (3,), radius) [scene units] of the normalising sphere: given by the file or else estimated."""
         center, radius = self.shape.center, self.shape.radius
         if center is None or radius is None:
             if self.hull:
@@ -323,7 +323,10 @@ class Capture:
 
 
 def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
-    """Return the camera of each photograph, with the mask of valid pixels. Both are reduced to `MAX_WIDTH` or less."""
+    """Return the camera of each photograph, with its mask of valid pixels (None: all are valid).
+
+    Both are reduced in size.
+    """
     small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
     for k, reader in enumerate(valid.readers):
         if reader not in small:
@@ -335,8 +338,8 @@ def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
 def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
     """Estimate a sphere around the object from the cameras alone. Returns (centre (3,), radius) [scene units].
 
-    The centre is the point nearest to all optical axes. Around it, take the largest ball that lies completely in the
-    view of every camera. The radius is half that of this ball.
+    The centre is the point nearest to all optical axes. The radius is half that of the largest ball around this centre
+    which every camera sees completely.
     """
     cameras = [shot.whole.camera for shot in capture.shots]
     origins = np.stack([camera.position for camera in cameras])

@@ -30,8 +30,8 @@ def decode(
     """Decode pixels. Returns (linear radiance, float32; clipped pixels, bool), both in the shape of `image`.
 
     `linear`: True if the encoded pixels are linear, False if they are sRGB. `saturation`: encoded value (1 = full
-    scale) from which a pixel is clipped. `gamma`, `contrast`: the camera's `Response`, which this function inverts. A
-    `LinearImage` is already decoded, and is returned unchanged.
+    scale) from which a pixel is clipped. `gamma`, `contrast`: exponent and S-curve of the camera's tone curve, which is
+    removed; 1: none. A `LinearImage` is already decoded, and is returned unchanged.
     """
     if isinstance(image, LinearImage):
         return image.rgb.astype(np.float32), image.clipped
@@ -49,9 +49,9 @@ def decode(
 
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
-    """Return the factors of vignetting and gain for each pixel, (H, W, 3), at 1 / `scale` of the photograph's size.
+    """Return the factors by which vignetting and gain change the radiance of each pixel: (H, W, 3).
 
-    Without vignetting, returns the gain alone, (3,). If the gain is 1 too, returns the number 1.
+    H, W: size of the photograph / `scale`. Without vignetting, returns the gain (3,). If the gain is 1, too, returns 1.
     """
     gain = np.float32(1) if shot.response.gain == (1, 1, 1) else np.array(shot.response.gain, np.float32)
     if not shot.response.vignetting:
@@ -61,7 +61,10 @@ def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
 
 
 def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
-    """Convert radiance (H, W, 3) to the linear values that the camera records, at 1 / `scale` of the shot's size."""
+    """Convert radiance (H, W, 3) to the linear values that the camera records: vignetting, gain, then the tone curve.
+
+    H, W: size of the photograph / `scale`.
+    """
     curved = (radiance * shade(shot, scale)) ** shot.response.gamma
     return curved if shot.response.contrast == 1 else contrasted(curved, shot.response.contrast)
 
@@ -69,8 +72,8 @@ def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
 def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
     """Read the encoded pixels (H, W, C) of an image file: uint8, uint16 or float32.
 
-    `field`: name of the file's entry in the scene file `scene`, for messages. Raises the errors of `require_header`.
-    Also raises InputError if pixels are damaged, infinite, NaN or too large.
+    `field`: what the file is in the scene file `scene`: "filename", "mask", "valid" or "ambient". Raises InputError if
+    the file is missing, is no image, has another size than the camera, or has damaged, infinite or NaN pixels.
     """
     require_header(path, field, shot, scene)
     what = f'photograph "{shot.name}", {field}'
@@ -82,9 +85,9 @@ def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
 
 
 def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
-    """Raise InputError if a file is missing, if it is no image, or if its size is not that of the film.
+    """Raise InputError if a file is missing, is no image, or has another size than the camera of the photograph `shot`.
 
-    The film is that of the photograph in the scene file `scene`. `field`: name of the file's entry there.
+    `field`: what the file is in the scene file `scene`: "filename", "mask", "valid" or "ambient". Pixels are not read.
     """
     what = f'photograph "{shot.name}", {field}'
     if not is_file(path):
@@ -97,9 +100,10 @@ def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:
 
 
 def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
-    """Read the encoded pixels (H, W, 3) of a photograph.
+    """Read the encoded pixels (H, W, 3) of a photograph. `scene`: its scene file, for messages.
 
-    If the photograph has an `ambient` image, it is subtracted, and the result is float32.
+    If the photograph has an `ambient` image, which shows only the room's light, it is subtracted, and the result is
+    float32. Raises InputError if a file cannot be read.
     """
     image = read_colours(shot, "filename", scene)
     if not shot.files.ambient:
@@ -117,9 +121,10 @@ def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
 
 
 def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Read the encoded pixels (H, W, 3) of a photograph's image file. `field`: "filename" or "ambient".
+    """Read the encoded pixels (H, W, 3) of the image file of a photograph. Grey is repeated in R, G and B.
 
-    The grey of a grey image is repeated in R, G and B. Transparent pixels become black.
+    `field`: "filename" for the photograph, "ambient" for the image of the room's light alone. `scene`: the scene file,
+    for messages. Colours are multiplied by alpha. Raises InputError if the file cannot be read.
     """
     file = getattr(shot.files, field)
     pixels = read_pixels(file, field, shot, scene)
@@ -137,16 +142,20 @@ def read_colours(shot: Shot, field: str, scene: Path) -> np.ndarray:
 
 
 def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
-    """Return whether encoded pixels are linear radiance. With the encoding `auto`, only 8-bit pixels are not linear."""
+    """Return True if encoded pixels are linear radiance, False if they are sRGB.
+
+    With the encoding "auto", 8-bit pixels are sRGB and all others are linear.
+    """
     if isinstance(pixels, LinearImage):
         return True
     return encoding == "linear" or (encoding == "auto" and pixels.dtype != np.uint8)
 
 
 def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
-    """Read a mask (H, W) uint8 of a photograph. `field`: "mask" or "valid".
+    """Read a mask (H, W) uint8 of a photograph: 255 is the object, or a valid pixel.
 
-    If its file is the photograph itself, the mask is the alpha channel. Raises InputError if there is none.
+    `field`: "mask" or "valid". `scene`: the scene file, for messages. If the file is the photograph itself, the mask is
+    its alpha channel. Raises InputError if the file cannot be read or has no alpha channel.
     """
     file, itself = getattr(shot.files, field), getattr(shot.files, field) == shot.files.filename
     pixels = read_pixels(file, field, shot, scene)

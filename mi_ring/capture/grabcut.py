@@ -11,9 +11,9 @@ def disk(radius: float) -> np.ndarray:
 
 
 def dilate_by_share(coverage: np.ndarray, share: float) -> np.ndarray:
-    """Dilate a mask (H, W) uint8, 0 or 1, by a disk. Its radius is `share` times the square root of the mask's area.
+    """Dilate a mask (H, W) uint8, 0 or 1, by a disk. The radius is `share` · square root of the mask's area [px].
 
-    If `share` is negative, the mask is eroded.
+    A negative `share` erodes the mask. Returns a mask of the same kind.
     """
     kernel = disk(abs(share) * np.sqrt(max(1, int(coverage.sum()))))
     return cv2.dilate(coverage, kernel) if share > 0 else cv2.erode(coverage, kernel)

@@ -36,13 +36,12 @@ def load_capture(
 ) -> Capture:
     """Read a scene file with photographs. Raises InputError for anything that cannot be fitted.
 
-    If `images` is False, only cameras and lights are read. This is enough for rendering. `width`: reduce photographs to
-    at most this width [px]; see `reduced`. By default, they keep their size. If `width` and `crop` are given, the
-    photographs are also cropped to the object.
+    `images`: False reads only cameras and lights. This is enough for rendering. `width`: photographs are reduced to at
+    most this width [px], and, unless `crop` is False, cropped to the object. None: they keep their size.
 
-    `masks` is one of "given", "auto" and "none". "given" uses the masks of the scene. "auto" does the same. But if the
-    scene has none, it makes masks by brightness. "none" ignores the masks of the scene, and makes masks by brightness.
-    Masks by brightness need a dark room. If the room was lit, there are no masks then.
+    `masks` is one of "given", "auto" and "none". "given" uses the masks of the scene. "auto" does the same, but makes
+    masks by brightness if the scene has none. "none" ignores the masks of the scene, and makes masks by brightness.
+    These need a dark room. If the room was lit, there are no masks then.
     """
     path = Path(path)
     if masks not in ("given", "auto", "none"):
@@ -90,7 +89,10 @@ def load_capture(
 
 
 def require_headers(shot: Shot, scene: Path, masks: str) -> None:
-    """Raise InputError if the header of an image file of a photograph is wrong. `masks`: as for `load_capture`."""
+    """Raise InputError if an image file of a photograph is missing, is no image, or has a wrong size.
+
+    Pixels are not read. `scene`: the scene file, for messages. `masks`: if it is "none", mask files are not examined.
+    """
     for field, file in shot.files._asdict().items():
         if file and (field != "mask" or masks != "none"):
             require_header(file, field, shot, scene)
@@ -99,16 +101,17 @@ def require_headers(shot: Shot, scene: Path, masks: str) -> None:
 def require_capture(path: Path, masks: str) -> None:
     """Raise InputError if a scene file, or the header of one of its image files, is invalid. Pixels are not read.
 
-    `masks`: as for `load_capture`.
+    `masks`: if it is "none", mask files are not examined.
     """
     for shot in load_capture(path, images=False).shots:
         require_headers(shot, path, masks)
 
 
 def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
-    """Return a mask (H, W) for each photograph. Each mask is read when it is used. `field`: "mask" or "valid".
+    """Return a sequence with the mask (H, W) uint8 of each photograph, or None. A mask is read when it is used.
 
-    Photographs with the same mask file share one array.
+    `field`: "mask" or "valid". `scene`: the scene file, for messages. Photographs with the same mask file share one
+    array.
     """
     readers: dict[tuple, Reader] = {}
 
@@ -121,9 +124,9 @@ def masks_of(shots: Sequence[Shot], field: str, scene: Path) -> Pixels:
 
 
 def require_scene(path: Path) -> None:
-    """Raise InputError if `path` does not exist, or if it is a photograph or a folder.
+    """Raise InputError if `path` is not a file, or if its suffix is that of a photograph.
 
-    The message says what to give instead.
+    The message says what to give. The content is not read.
     """
     photographs = path.is_dir() or path.suffix.lower() in SUFFIXES
     usual = "the XML file of a scene" + ("; mi-ring photos makes one of a folder of photographs" * photographs)
@@ -134,7 +137,7 @@ def require_scene(path: Path) -> None:
 
 
 def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
-    """Load a scene file. Returns (scene, its photographs).
+    """Load a scene file. Returns (Mitsuba scene, its photographs as `Shot`, without pixels).
 
     Raises InputError if the file cannot be read, or if it has no photographs.
     """
@@ -162,11 +165,11 @@ def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
 
 
 def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
-    """Raise InputError if the XML is invalid, or if a photograph or its light has no place.
+    """Raise InputError if a scene file is no XML, or if it does not say where a camera or a photograph's light is.
 
-    Without a place, Mitsuba would use the origin. It ignores the last row of a matrix: this row must be 0 0 0 1. Files
-    that the scene includes are checked, too. `above`: the files that include this one. Raises UnicodeDecodeError if the
-    file is not UTF-8.
+    Mitsuba would then use the origin. The last row of a pose matrix must be 0 0 0 1, because Mitsuba ignores it. Files
+    that the scene includes are checked, too. `above`: the files that include this one; empty for the scene file. Raises
+    UnicodeDecodeError if the file is not UTF-8.
     """
     content = path.read_bytes()
     content.decode("utf-8")
@@ -196,7 +199,10 @@ def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
 
 
 def is_affine(row: Sequence[str]) -> bool:
-    """Return whether the last `row` of a matrix is 0 0 0 1. Also returns True if a word of it is no number."""
+    """Test whether `row`, the last row of a matrix as four words, is 0 0 0 1.
+
+    Returns True, too, if a word is no number.
+    """
     try:
         return bool(np.allclose([float(word) for word in row], [0, 0, 0, 1]))
     except ValueError:  # parameters, and words that Mitsuba refuses
@@ -204,15 +210,18 @@ def is_affine(row: Sequence[str]) -> bool:
 
 
 def load_views(path: Path) -> list[MaskedCamera]:
-    """Read the cameras of a scene file, each with its mask of valid pixels. Raises InputError if this fails."""
+    """Read the camera of each photograph in a scene file, with its mask of valid pixels; None: all pixels are valid.
+
+    Both are reduced in size. Raises InputError if the file cannot be read.
+    """
     _, shots = open_scene(path)
     return views_of(shots, masks_of(shots, "valid", path))
 
 
 def recompute_normals(scene: mi.Scene) -> None:
-    """Recompute the vertex normals of those meshes in `scene` whose files have none. `scene` is changed.
+    """Recompute the vertex normals of meshes in `scene`, in place. Normals that come from a mesh file do not change.
 
-    After this, all processes have the same normals.
+    After this, all processes of a fit have exactly the same normals.
     """
     for shape in scene.shapes():
         if not shape.is_mesh() or not shape.has_vertex_normals():
@@ -226,7 +235,7 @@ def recompute_normals(scene: mi.Scene) -> None:
 
 
 def reason(error: RuntimeError) -> str:
-    """Return the message of a Mitsuba parser error as one line."""
+    """Return the message of an error of Mitsuba's parser as one line, without its prefix and traceback."""
     text = str(error).split("] ", 1)[-1]
     if "Traceback" in text:  # of one of our plugins: the message follows the name of the exception
         text = text.split("Error: ", 1)[-1]

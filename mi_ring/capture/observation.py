@@ -16,7 +16,10 @@ REMEMBERED_PIXELS = 2**24
 
 
 class Observation(NamedTuple):
-    """The pixels of n photographs of one size: radiance, clipped pixels, masks. A fit compares renderings with them."""
+    """The pixels of n photographs of one size: radiance, clipped pixels and masks.
+
+    A fit compares renderings with them.
+    """
 
     rgb: Tensor  #: (n, H, W, 3) linear radiance, 1.0 = full scale of the file
     clipped: Tensor  #: (n, H, W, 3) bool: the true radiance is at least this
@@ -25,10 +28,10 @@ class Observation(NamedTuple):
     valid: Tensor | None  #: (n, H, W) bool; invalid pixels are black and clipped. None: all are valid
 
     def surely(self, coverage: Tensor) -> Tensor:
-        """Return which pixels show only the object, (n, H, W) bool.
+        """Return a boolean mask (n, H, W): True where a pixel shows only the object.
 
-        `coverage` (n, H, W): the object's share of each pixel. At the returned pixels, it is above 0.99. If the
-        photograph has a mask, the mask is above 0.99 there, too.
+        `coverage` (n, H, W): the share of each pixel that the predicted object covers. At these pixels it is above
+        0.99. If a photograph has a mask, the mask is above 0.99 there, too.
         """
         mask = torch.where(self.masked.to(self.mask.device)[:, None, None], self.mask, 1.0)
         return torch.minimum(mask, coverage) > 0.99
@@ -51,9 +54,10 @@ class Observation(NamedTuple):
 def observed(
     shot: Shot, image: np.ndarray | LinearImage, mask: np.ndarray | None, valid: np.ndarray | None, scale: int
 ) -> Observation:
-    """Make the observation of one photograph: decode its pixels, and reduce them by the factor `scale` (box filter).
+    """Make the observation of one photograph: decode its pixels, and average blocks of `scale` × `scale` pixels.
 
-    `image` (H, W, 3): encoded pixels. `mask`, `valid`: (H, W) uint8 as in the files; None if the photograph has none.
+    `image` (H, W, 3): encoded pixels. `mask`: (H, W) uint8, 255 on the object; None: no mask. `valid`: (H, W) uint8, 0
+    where a pixel is ignored; None: all pixels are valid.
     """
     curve = shot.response.gamma, shot.response.contrast
     linear, clipped = decode(image, is_linear(shot.encoding, image), shot.saturation, *curve)
@@ -75,16 +79,19 @@ def observed(
 
 
 class ObservationCache:
-    """Cache of the observations of single photographs, with up to `REMEMBERED_PIXELS` pixels in total.
+    """Cache of the observations of single photographs, with at most `REMEMBERED_PIXELS` pixels in total.
 
-    For each photograph, it keeps the observation of the scale that was used last. Observations of scale 1 are not kept.
+    It keeps one observation for each photograph, the last one, if its pixels are reduced by a factor `scale` above 1.
     """
 
     def __init__(self) -> None:
         self.kept: dict[int, tuple[int, Observation]] = {}  # scale and observation by index
 
     def get(self, k: int, scale: int, observe: Callable[[], Observation]) -> Observation:
-        """Return the observation of photograph `k` at this scale. If the cache does not have it, `observe` makes it."""
+        """Return the observation of photograph `k`, reduced by the factor `scale`.
+
+        If it is not in the cache, call `observe()`.
+        """
         if k in self.kept and self.kept[k][0] == scale:
             return self.kept[k][1]
         self.kept.pop(k, None)

@@ -12,11 +12,11 @@ Reader = Callable[[], np.ndarray]
 
 
 class Pixels(Sequence):
-    """A sequence of arrays. An array is read when it is used.
+    """A sequence of arrays. An array is read when it is used, and then cached.
 
-    Each item has a reader, which is a function that returns the array. An item without a reader is None. Items with
-    equal readers share one array. The cache keeps the arrays that were read first, up to `KEPT` bytes. A fit draws
-    photographs at random, so no other rule is better. Parts of a sequence share its cache.
+    Each item has a reader, a function without arguments that returns the array. An item without an array is None, and
+    so is its reader. Items with equal readers share one array. The cache keeps the arrays that were read first, up to
+    `KEPT` bytes; a fit draws photographs at random, so no other rule is better. Slices of a sequence share its cache.
     """
 
     def __init__(self, readers: Iterable[Reader | None] = (), kept: dict[Reader, np.ndarray] | None = None) -> None:
@@ -26,7 +26,7 @@ class Pixels(Sequence):
 
     @classmethod
     def of(cls, arrays: Iterable[np.ndarray | None]) -> "Pixels":
-        """Make a sequence of arrays that are in memory. They are not copied."""
+        """Make a sequence of `arrays` that are in memory. They are not copied. An item may be None."""
         return cls(None if array is None else partial(np.asarray, array) for array in arrays)
 
     def __len__(self) -> int:
@@ -45,15 +45,19 @@ class Pixels(Sequence):
 
     @property
     def given(self) -> list[bool]:
-        """For each item, whether it has a reader."""
+        """One bool for each item: True if there is an array, False if the item is None. Nothing is read."""
         return [reader is not None for reader in self.readers]
 
     def part(self, index: Iterable[int]) -> "Pixels":
-        """Return the sequence of the items with these indices. It shares the cache."""
+        """Return a sequence of the items with the indices `index`, in this order. It shares the cache."""
         return Pixels([self.readers[k] for k in index], self.kept)
 
     def replaced(self, readers: Mapping[int, Reader | None]) -> "Pixels":
-        """Return a copy of the sequence in which items have other readers. `readers`: the new ones, by index."""
+        """Return a copy of the sequence in which some items have other readers. All other items are unchanged.
+
+        `readers`: a dict from the index of an item to its new reader, a function that returns the array. With None
+        instead of a reader, the item has no array.
+        """
         several = [readers.get(k, reader) for k, reader in enumerate(self.readers)]
         left = {*several}
         return Pixels(several, {reader: array for reader, array in self.kept.items() if reader in left})

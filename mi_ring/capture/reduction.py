@@ -39,11 +39,11 @@ MORE = np.array([[-1], [1]])  #: bounds found in a reduced mask are widened by o
 
 
 def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, crop: bool = True) -> Capture:
-    """Return a capture with photographs of at most `width` [px], cropped to the object where this saves enough pixels.
+    """Return a copy of the capture whose photographs are at most `width` [px] wide.
 
-    If `crop` is False, nothing is cropped. If `by_brightness` is set, masks are first made as by
-    `with_masks_by_brightness`. Small photographs are not changed. If the capture was reduced before, nothing is
-    changed, whatever its width. Raises InputError like `load_capture`.
+    They may also be cropped to the object. `by_brightness`: True replaces the masks by masks of the bright pixels.
+    `crop`: False never crops; True crops where this saves enough pixels. If all photographs are small, or if the
+    capture was reduced before, its pixels do not change. Raises InputError if an image file is invalid.
     """
     small = all(shot.size[0] <= SMALL and reduction_factor(shot.size, width) == 1 for shot in capture.shots)
     if any(shot.window for shot in capture.shots) or not capture.images or small:
@@ -70,15 +70,16 @@ def reduced(capture: Capture, width: int = WIDTH, by_brightness: bool = False, c
 def reduction_factor(size: tuple[int, ...], width: int) -> float:
     """Return the factor, at least 1, by which an image must shrink to be at most `width` [px] wide.
 
-    `size`: (width, height) [px] of the image. The height of the reduced image is at most `HIGHEST` · `width`.
+    `size`: (width, height) [px] of the image. The height of the reduced image is at most 1.5 `width`.
     """
     return max(1.0, size[0] / width, size[1] / (HIGHEST * width))
 
 
 def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], width: int) -> Window:
-    """Return the window with the upper left corner `low` (2,) and the size `extent` (2,) [px of the photograph].
+    """Make a window: a rectangle of a photograph, and the size, at most `width` [px] wide, to which it is reduced.
 
-    The window is reduced to at most `width` [px]. `whole`: (width, height) [px] of the photograph.
+    `whole`: (width, height) of the photograph [px]. `low` (2,): upper left corner of the rectangle (column, row).
+    `extent`: its (width, height), which may become slightly smaller.
     """
     scale = reduction_factor(tuple(extent), width)
     blocks = int(scale)  # the first step of the reduction averages squares of so many pixels
@@ -89,11 +90,11 @@ def windowed(whole: tuple[int, int], low: ArrayLike, extent: Sequence[int], widt
 
 
 def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], width: int) -> list[Window]:
-    """Choose a window around the object in each photograph, reduced to at most `width` [px].
+    """Choose for each photograph a window around the object: a rectangle, and the size to which it is reduced.
 
     `bounds`: for each photograph, the lowest and highest corner (2, 2) [px] of the object; None if it has no mask.
-    Photographs of one size get windows of one size, so that one launch can render them together. If one of these has no
-    mask, none of them is cropped.
+    `width`: largest width of a reduced window [px]. Photographs of one size get windows of one size, so that one launch
+    can render them together. If one of these has no mask, none of them is cropped.
     """
     windows = []
     sizes = [shot.size for shot in shots]
@@ -110,10 +111,10 @@ def crop_windows(shots: Sequence[Shot], bounds: Sequence[np.ndarray | None], wid
 
 
 def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
-    """Return the lowest and highest corner (2, 2) [px] of the object in each mask.
+    """Return the lowest and the highest corner (2, 2) of the object in each mask: (column, row) [px].
 
-    If a mask is missing or empty, there is None instead. `large`: True if the masks are large. Then the cache folder
-    keeps the corners.
+    A missing or empty mask gives None. `large`: True keeps the corners in the cache folder, because masks take long to
+    read.
     """
     several = {reader: k for k, reader in enumerate(capture.masks.readers) if reader}  # some may share a mask
 
@@ -141,10 +142,10 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
 
 
 def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
-    """Return a capture in which each photograph shows only its window.
+    """Return a copy of the capture in which each photograph shows only its window, reduced to the window's size.
 
-    If the photographs are files, they are read now, and the cache folder keeps the results. `doing`: label of the
-    progress bar.
+    `windows`: one for each photograph. Photographs that are files are read now, and the results are stored in the cache
+    folder. `doing`: label of the progress bar.
     """
     shots = tuple(shot.through(window) for shot, window in zip(capture.shots, windows))
 
@@ -185,9 +186,10 @@ def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
 
 
 def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[int], doing: str) -> list[Any]:
-    """Call `function(k)` for each k of `index`, in as many threads as memory allows. Returns the results in order.
+    """Call `function(k)` for each photograph k of `index`, in as many threads as memory allows.
 
-    `function` decodes photograph k. `doing`: label of the progress bar.
+    `function` decodes photograph k. Returns a list of its results, in the order of `index`. `doing`: label of the
+    progress bar.
     """
 
     def memory(shot: Shot) -> int:
@@ -203,7 +205,8 @@ def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[in
 def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
     """Decode a photograph to linear radiance, crop it to the window, and resize it to the window's size.
 
-    It works in strips to save memory. Returns float16 for a photograph of 8 bits, otherwise float32.
+    `read`: returns the encoded pixels (H, W, 3). Memory is saved by decoding in strips. The radiance is float16 for a
+    photograph of 8 bits, otherwise float32.
     """
     image = read()
     radiance, clipped = [], []
@@ -221,20 +224,24 @@ def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
 
 
 def reduced_mask(read: Reader, window: Window) -> np.ndarray:
-    """Crop a mask to a window and resize it: (H, W) uint8, the object's coverage from 0 to 255."""
+    """Crop a mask to a window and resize it: (H, W) uint8, the object's coverage from 0 to 255.
+
+    `read`: returns the mask of the whole photograph, uint8.
+    """
     return means(read(), window).round().astype(np.uint8)
 
 
 def reduced_valid(read: Reader, window: Window) -> np.ndarray:
     """Crop a mask of valid pixels to a window and resize it: (H, W) uint8.
 
-    A pixel is 255 if all pixels of the photograph that it covers are valid. Otherwise it is 0.
+    `read`: returns the mask of the whole photograph. A pixel of the result is 255 if all pixels of the photograph that
+    it covers are valid, otherwise 0.
     """
     return np.where(means(read() > 127, window) > 1 - 1e-5, np.uint8(255), np.uint8(0))
 
 
 def means(mask: np.ndarray, window: Window) -> np.ndarray:
-    """Crop a mask (H, W) to a window, and resize it by area means."""
+    """Crop a mask (H, W) of a whole photograph to a window, and resize it to the window's size by area means."""
     (left, top), (width, height) = window.corner, window.extent
     part = mask[top : top + height, left : left + width, None]
     return resized(averaged(part, window.blocks), window)[..., 0]
@@ -246,14 +253,17 @@ def averaged(pixels: np.ndarray, blocks: int) -> np.ndarray:
 
 
 def resized(pixels: np.ndarray, window: Window) -> np.ndarray:
-    """Resize an image (H, W, C) to the size of a window by area means."""
+    """Resize an image (H, W, C) to the size of `window` by area means. It shows the rectangle of the window already."""
     if pixels.shape[1::-1] == window.size:
         return pixels
     return cv2.resize(pixels, window.size, interpolation=cv2.INTER_AREA).reshape(*window.size[::-1], -1)
 
 
 def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
-    """Paste the mask (h, w) uint8 of a window into a mask (H, W) of the whole photograph, 0 outside the window."""
+    """Enlarge the mask (h, w) uint8 of a window, and paste it into a mask (H, W) of the whole photograph.
+
+    Outside the window, the result is 0. If `window` is None, `mask` is returned unchanged.
+    """
     if window is None:
         return mask
     (left, top), (width, height) = window.corner, window.extent
@@ -263,9 +273,9 @@ def whole_mask(mask: np.ndarray, window: Window | None) -> np.ndarray:
 
 
 def source(read: Reader | None) -> tuple | None:
-    """Return a tuple that identifies what a reader of `mi_ring.capture.decoding` reads. It has digests of the files.
+    """Return a tuple that identifies what a reader of image files returns. It contains hashes of the files.
 
-    If two readers have equal tuples, they read equal arrays. Returns None for any other reader.
+    Two readers with equal tuples read equal arrays. Returns None if `read` does not read files.
     """
     if not isinstance(read, partial) or read.func not in (read_photograph, read_mask):
         return None
@@ -275,12 +285,15 @@ def source(read: Reader | None) -> tuple | None:
 
 
 def key_of(*parts: Any) -> str:
-    """Return the key in the cache for a result that is computed from `parts`. The key is a hash of `parts`."""
+    """Return the key in the cache folder for a result that is computed from `parts`. The key is a hash of `parts`."""
     return hashlib.blake2b(repr((FORMAT, *parts)).encode(), digest_size=16).hexdigest()
 
 
 def packed(arrays: dict[str, Any]) -> memoryview:
-    """Serialise a reduced photograph and its masks for the cache."""
+    """Convert a reduced photograph and its masks to bytes for the cache folder.
+
+    `arrays`: a dict with "images" (a `LinearImage`), and "masks" and "valid" if the photograph has them.
+    """
     image = arrays["images"]
     content = arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped)}
     buffer = io.BytesIO()
@@ -289,7 +302,11 @@ def packed(arrays: dict[str, Any]) -> memoryview:
 
 
 def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | LinearImage:
-    """Read the array `name` from the cache entry `key`. If the entry is missing or damaged, return `make()` instead."""
+    """Read one array from the entry `key` of the cache folder.
+
+    If the entry is missing or damaged, return `make()` instead. `name`: "images", "masks" or "valid". "images" gives a
+    `LinearImage`. A damaged entry is removed.
+    """
     path = cache.cached(key)
     try:
         with np.load(path or "") as file:

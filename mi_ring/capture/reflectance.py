@@ -16,10 +16,9 @@ from mi_ring.scene.xml_elements import load_bsdf
 def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
     """Choose the BSDF parameters that BRDF-Net predicts. Returns (parameters, XML of the BSDF that reads them).
 
-    `ranges`: a dict from names of parameters to (lowest, highest) values. The names are those in the BSDF's
-    documentation. An infinite highest value means no upper limit. If the dict is empty, all parameters of
-    `cooktorrance` are chosen that are not constant. Raises InputError if the BSDF has no such parameter. The message
-    lists those that exist.
+    `ranges`: a dict from parameter names, as in the BSDF's documentation, to (lowest, highest) value; the highest may
+    be infinite. If the dict is empty, all parameters of `cooktorrance` that are not constant are chosen. Raises
+    InputError if the scene's BSDF lacks a parameter. The message lists those that exist.
     """
     scene, bsdf = capture.path, capture.shape.bsdf()
     element = bsdf_element(ElementTree.fromstring(capture.xml), scene)[1]
@@ -73,9 +72,9 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:
-    """Return the network output for which BRDF-Net predicts the mean of `value`, in the range from `low` to `high`.
+    """Return the network output for which BRDF-Net predicts the mean of the array `value`.
 
-    If `high` is infinite, returns 0.
+    `low`, `high`: range of the parameter. If `high` is infinite, returns 0.
     """
     if math.isinf(high):
         return 0.0

@@ -33,7 +33,7 @@ REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *OPTIONAL}
 
 
 def photograph_element(shot: Shot) -> Element:
-    """Make the XML of a photograph. The file names in `shot` must be relative to the scene file."""
+    """Make the XML element of a photograph. The file names in `shot` must be relative to the scene file."""
     shot = shot.whole
     element = ElementTree.Element("sensor", type="photograph", id=shot.name)
     for field, file in shot.files._asdict().items():
@@ -65,11 +65,11 @@ def scene_element(
     photographs: Iterable[Element] = (), center: np.ndarray | None = None, radius: float | None = None,
     ground: np.ndarray | None = None, up: np.ndarray | None = None, metres: float | None = None, fresnel: bool = False,
 ) -> Element:  # fmt: skip
-    """Make the XML of a scene with these photographs, a `photometric` integrator and a `shapenet` with `cooktorrance`.
+    """Make the XML of a scene: a `photometric` integrator, and a `shapenet` with the BSDF `cooktorrance`.
 
-    `center` (3,), `radius`: normalising sphere [scene units]. `ground` (3,): a point on the table. `up` (3,): normal of
-    the table, or up direction. `metres`: length of a scene unit [m]; None: unknown. `fresnel`: give `cooktorrance` its
-    Fresnel term.
+    `photographs`: XML elements to add. `center` (3,), `radius`: normalising sphere [scene units]. `ground` (3,): a
+    point on the table. `up` (3,): normal of the table, or up direction. `metres`: length of a scene unit [m]. What is
+    None is left out. `fresnel`: True gives the BSDF a Fresnel term.
     """
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "integrator", type="photometric")
@@ -89,9 +89,9 @@ def scene_element(
 
 
 def table_element(picture: str, square: np.ndarray) -> Element:
-    """Make the XML of a diffuse `table`. `picture`: image file of the albedo.
+    """Make the XML of a diffuse table, a textured rectangle. `picture`: file name of the texture, the table's albedo.
 
-    `square` (4, 4): transform `to_world` of the table.
+    `square` (4, 4): the table's transform `to_world`.
     """
     element = ElementTree.Element("shape", type="table")
     add_pose(element, square)
@@ -103,13 +103,13 @@ def table_element(picture: str, square: np.ndarray) -> Element:
 
 
 def scene_bytes(root: Element) -> bytes:
-    """Return the XML of a scene as the content of a file."""
+    """Indent the XML of a scene, and return it as the UTF-8 content of a file. `root` is indented in place."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, "utf-8")
 
 
 def emitter_element(light: Light) -> Element:
-    """Make the XML of a light: `point` or `directional`."""
+    """Make the XML element of a light: an emitter of type `point` or `directional`."""
     emitter = ElementTree.Element("emitter", type=light.kind)
     tag, where, strength = {
         "point": ("point", "position", "intensity"), "directional": ("vector", "direction", "irradiance")
@@ -121,10 +121,10 @@ def emitter_element(light: Light) -> Element:
 
 
 def perspective_element(camera: Camera, points: np.ndarray) -> Element:
-    """Make the XML of a camera as Mitsuba's `perspective`, without lens distortion.
+    """Make the XML of a camera as Mitsuba's sensor `perspective`. Lens distortion is left out.
 
-    The clipping planes enclose `points` (n, 3). Mitsuba's pixels are square. If the camera's pixels are not, the number
-    of rows is changed.
+    `points` (n, 3): the clipping planes enclose them. Mitsuba's pixels are square. If the camera's pixels are not
+    square, the number of rows is changed.
     """
     (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
     distance = np.linalg.norm(points - camera.position, axis=1)
@@ -166,10 +166,10 @@ def recalibrated_xml(
 ) -> bytes:  # fmt: skip
     """Return new content for a scene file, with the cameras, lights and responses of `shots`. No file is written.
 
-    `scene`: old content. A shot belongs to the photograph with its name as id. If there is none, it belongs to the
-    photograph at the same position. `room` (BASIS, 3): room light; None: the scene gets none. `frames`: axes ("world",
-    "camera") for which room light is written even if it is black; default: the axes of the rooms in the file. `lamps`:
-    point and directional lights for all photographs; None: keep those of the file.
+    `scene`: the old content. A shot replaces the photograph whose id is its name; without ids, the photograph at the
+    same position. `room` (BASIS, 3): spherical harmonics of the room's light; None: none. `frames`: "world" and/or
+    "camera"; light in these axes is written even if it is black; None: the axes that the old content has. `lamps`:
+    point and directional lights for all photographs; None: keep the old ones.
     """
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
@@ -195,7 +195,7 @@ def recalibrated_xml(
 
 
 def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
-    """Return new content for a scene file, in which `shots` replace the photographs. `scene`: old content."""
+    """Return new content for a scene file, in which `shots` replace all photographs. `scene`: the old content."""
     root = ElementTree.fromstring(scene)
     for element in root.findall("sensor[@type='photograph']"):
         root.remove(element)
@@ -204,9 +204,10 @@ def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
 
 
 def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) -> bytes:
-    """Return new content for a scene file, with new masks. `scene`: old content. `shots`: its photographs.
+    """Return new content for a scene file, with new masks. No file is written. `scene`: the old content.
 
-    `masks`: a dict from the index of a photograph to its mask file, relative to the scene file.
+    `shots`: the photographs of the scene. `masks`: a dict from the index of a photograph to the name of its new mask
+    file, relative to the scene file. Other photographs keep their masks.
     """
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
@@ -218,11 +219,11 @@ def remasked_xml(scene: bytes, shots: Sequence[Shot], masks: Mapping[int, str]) 
 
 
 def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, int]]:
-    """Find the XML elements of photographs in a scene. Returns (element, index in `shots`) for each.
+    """Find the XML elements of photographs in a scene. Returns a list of (element, index of its shot in `shots`).
 
-    An element belongs to the shot with its id. If there is none, it belongs to the shot at the same position. If there
-    are more elements than shots, elements without a shot are removed from `root`. Raises InputError if ids are needed
-    for this and are missing.
+    An element belongs to the shot whose name is its id; without ids, to the shot at the same position. If there are
+    more elements than shots, elements without a shot are removed from `root`. Raises InputError if this is impossible
+    because ids are missing.
     """
     elements = root.findall(".//sensor[@type='photograph']")
     named = {shot.name: k for k, shot in enumerate(shots)}
@@ -237,9 +238,10 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
 
 
 def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:
-    """Make the XML of room light (BASIS, 3). One element has the part in world axes, another the part in camera axes.
+    """Make the XML of room light: one element for light that is fixed in world axes, one for light in camera axes.
 
-    A black part is left out, unless `frames` contains its axes ("world" or "camera").
+    `room` (BASIS, 3): spherical harmonics, first in world axes, then in camera axes. An element whose light is black is
+    left out, unless `frames` contains its axes, "world" or "camera".
     """
     world, camera = room[:PER_FRAME], np.vstack([np.zeros_like(room[:1]), room[PER_FRAME:]])
     # Uniform light belongs to either part.
@@ -250,9 +252,9 @@ def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Elemen
 
 
 def room_element(frame: str, harmonics: np.ndarray) -> Element:
-    """Make the XML of a `room`. `frame`: its axes, "world" or "camera".
+    """Make the XML of a `room` emitter: light from all around, in the axes `frame`, "world" or "camera".
 
-    `harmonics`: (PER_FRAME, 3), or fewer rows.
+    `harmonics` (n, 3): real spherical harmonics of its radiance; n at most PER_FRAME.
     """
     orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
     harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
@@ -263,7 +265,7 @@ def room_element(frame: str, harmonics: np.ndarray) -> Element:
 
 
 def move_names(root: Element, source: Path, folder: Path) -> None:
-    """Change the file names in a scene. Names relative to the folder `source` become relative to `folder`."""
+    """Change the file names in a scene in place. Names relative to the folder `source` become relative to `folder`."""
     for element in root.iter("string"):
         if element.get("name") not in FILES:
             continue
@@ -273,10 +275,10 @@ def move_names(root: Element, source: Path, folder: Path) -> None:
 
 
 def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> bytes:
-    """Return content for a scene file in the results folder `folder`: the scene in `path`, with the fitted object.
+    """Return new content for the scene file `path`, as a file of the results folder `folder`, with the fitted object.
 
-    `subdivisions`: level of the object's mesh. `bsdf`: XML of the object's BSDF. File names become relative to
-    `folder`. Raises InputError if the scene or the `shapenet` cannot be rewritten or fitted.
+    No file is written. `subdivisions`: level of the object's mesh. `bsdf`: XML of the object's BSDF. File names become
+    relative to `folder`. Raises InputError if the scene has a feature that a fit does not support.
     """
     root = ElementTree.parse(path).getroot()
     old_bsdf, _ = bsdf_element(root, path)
@@ -295,9 +297,10 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
 
 
 def bsdf_element(root: Element, path: Path) -> tuple[Element, Element]:
-    """Find the BSDF of the `shapenet` in a scene. Returns (its <bsdf> or <ref>, the <bsdf> itself).
+    """Find the BSDF of the `shapenet` in a scene. Returns (element in the `shapenet`, <bsdf> element).
 
-    Raises InputError if there is none, or if a part of the scene is in another file. The message names the file `path`.
+    Both are the same, or the first is a <ref> to the second. `path`: the scene file, for messages. Raises InputError if
+    there is no BSDF, or if the scene has <include>, <default> or <path> elements.
     """
     for tag in ("include", "default", "path"):
         if root.find(f".//{tag}") is not None:

@@ -28,9 +28,10 @@ class Resources:
 
 @contextlib.contextmanager
 def ray_cluster(resources: Resources) -> Iterator[Any]:
-    """Start Ray or connect to it, as a context manager. At the end, disconnects from it or stops it.
+    """Context manager that starts Ray, or connects to a running cluster. Yields the module `ray`.
 
-    Raises InputError if Ray cannot be started or reached, or if no machine has the resources for a fit.
+    At the end, Ray is stopped or disconnected. Raises InputError if Ray cannot be started or reached, or if no machine
+    has the resources that one fit needs.
     """
     ray = need("ray", "mi-ring batch")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -57,10 +58,11 @@ def ray_cluster(resources: Resources) -> Iterator[Any]:
 
 
 def fit_all(jobs: Mapping[Job, str], resources: Resources, retries: int, on_poll: Callable[[], None]) -> None:
-    """Fit all jobs on Ray. Returns when all have ended. Their records then say how they ended.
+    """Fit all jobs with Ray, several at a time. Returns when all have ended. Their saved records say how they ended.
 
-    `jobs`: a dict from jobs to their fingerprints. `retries`: as for `fit_to_the_end`. `on_poll` is called about once a
-    second. If a worker dies, Ray replaces it, and its fit continues from the last checkpoint.
+    `jobs`: a dict from each job to the hash of its input. `retries`: how often a fit whose process has died is
+    restarted without progress. `on_poll` is called about once a second. If a worker dies, Ray replaces it, and its fit
+    continues from the last checkpoint.
     """
     with ray_cluster(resources) as ray:
         fit = ray.remote(fit_to_the_end).options(

@@ -20,11 +20,11 @@ DIE_WITH_PARENT = 1  #: PR_SET_PDEATHSIG of prctl(2)
 def fit_to_the_end(
     job: Job, fingerprint: str, retries: int, extra: tuple[str, ...] = (), on_line: Callable[[str], None] | None = None
 ) -> Record:
-    """Fit a scene, or continue its fit. Returns a record with the state done or failed.
+    """Fit a scene in a process of its own, or continue its fit. Returns a record whose state is "done" or "failed".
 
-    If the fit's process dies, it is started again. After `retries` restarts without progress, the fit has failed.
-    `fingerprint`: that of the job. `extra`: options that do not change the result. `on_line` is called with each
-    printed line. If the calling process is killed, call the function again to continue.
+    If the process dies, it is started again. After `retries` restarts without progress, the fit has failed.
+    `fingerprint`: hash of the job's input. `extra`: further command-line options, which do not change the result.
+    `on_line` is called with each printed line. If the calling process is killed, call the function again to continue.
     """
     record = job.record
     if record.fingerprint != fingerprint:  # the fit itself moves the results of the other fit aside
@@ -51,9 +51,10 @@ def fit_to_the_end(
 
 
 def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = None) -> tuple[int, str]:
-    """Run a fit, and write its output to `job.output`. Returns (exit status, last line of the output).
+    """Run a fit in a child process, and append its output to the file `job.output`.
 
-    If this process ends, the fit ends, too.
+    `command`: the command line. `on_line` is called with each printed line. Returns (exit status, last line of the
+    output or reason for its end). If this process ends, the fit ends, too.
     """
     cwd = job.cwd if job.cwd.is_dir() else None  # a worker on another machine may lack this folder
     options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -79,9 +80,9 @@ def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = No
 
 
 def die_with_parent() -> dict[str, Any]:
-    """Return options of `Popen` with which the kernel kills the child process when this process ends.
+    """Return arguments of `subprocess.Popen` with which the kernel kills the child process when this process ends.
 
-    Only Linux has this. On other systems, the options are empty.
+    Only Linux can do this. On other systems, the result is empty.
     """
     if not sys.platform.startswith("linux"):
         return {}

@@ -19,7 +19,7 @@ CHECKPOINTS = "checkpoint.pt", "checkpoint.before.pt"
 
 @dataclass(frozen=True)
 class Record:
-    """The state of the fit of a job."""
+    """The state of the fit of a job, as a file beside the results stores it."""
 
     state: str = "waiting"  #: waiting, running, interrupted, failed or done
     fingerprint: str = ""  #: of the job that is being fitted
@@ -33,7 +33,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Job:
-    """A scene, the folder of its results, and the options of `mi_ring.fit`. The two paths are absolute."""
+    """A scene to fit, the folder of its results, and options of `mi-ring fit`. Scene and folder are absolute paths."""
 
     scene: Path
     folder: Path
@@ -52,7 +52,7 @@ class Job:
 
     @property
     def record(self) -> Record:
-        """The last saved record. If it is missing or damaged, it is the record of a waiting job."""
+        """The last saved record. If there is none, or if it is damaged: a new record with the state "waiting"."""
         with contextlib.suppress(TypeError):
             return Record(**read_json(self.output.with_suffix(".json")))
         return Record()
@@ -65,7 +65,7 @@ class Job:
         return record
 
     def fingerprint(self) -> str:
-        """Return a hash of the options, of the scene file, and of all files that these two mention."""
+        """Return a hash of the input: the options, the scene file, and all files that these two name."""
         result = hashlib.blake2b(repr(self.options).encode(), digest_size=16)
         with contextlib.suppress(OSError):  # the fit reports what is wrong with the scene file
             text = self.scene.read_bytes()
@@ -79,11 +79,14 @@ class Job:
         return result.hexdigest()
 
     def has_checkpoint(self, since: float) -> bool:
-        """Return whether there is a checkpoint that was written at the time `since` or later."""
+        """Test whether a checkpoint was written at the time `since` [s, Unix time] or later."""
         return any(modified(self.folder / name) / 1e9 >= since for name in CHECKPOINTS)
 
     def iteration(self, since: float = 0.0) -> int:
-        """Return the last iteration in log.jsonl. Returns 0 if the log is missing or older than the time `since`."""
+        """Return the last iteration in log.jsonl.
+
+        Returns 0 if the log is missing, or if it was last written before the time `since` [s, Unix time].
+        """
         with contextlib.suppress(OSError, KeyError, TypeError):
             if modified(self.folder / "log.jsonl") / 1e9 >= since:
                 return int(max((entry["iteration"] for entry in read_log(self.folder)), default=0))
@@ -99,7 +102,7 @@ class Job:
         return f"iteration {iteration}{' of ' * bool(planned)}{planned}" if iteration else "begins"
 
     def is_done(self, fingerprint: str) -> bool:
-        """Return whether the folder has complete results for this fingerprint."""
+        """Test whether the results folder has complete results of the input with this hash, `fingerprint`."""
         record, ring = self.record, modified(self.folder / "ring.pt")
         there = ring and (self.folder / "report.html").is_file()
         return bool(there) and (record.done, record.written) == (fingerprint, ring)
@@ -114,10 +117,10 @@ def modified(path: Path) -> int:
 
 
 def make_jobs(scenes: Sequence[Path], out: Path, options: Sequence[str]) -> list[Job]:
-    """Make a job for each scene. `out`: folder for the results of all jobs.
+    """Make a job for each scene. `out`: folder for all results. `options`: command-line options of each fit.
 
-    Raises InputError if a file is missing, if two jobs would have the same results folder, or if a results folder would
-    be one that contains the scene file.
+    Raises InputError if a scene file is missing, if two jobs would have the same results folder, or if a scene file is
+    inside its results folder.
     """
     jobs: dict[str, Job] = {}
     for scene in scenes:

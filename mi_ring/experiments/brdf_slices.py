@@ -1,4 +1,4 @@
-"""BRDF slices: values of a BRDF for light and camera in the same direction. Mitsuba evaluates them."""
+"""BRDF slices: values of a BRDF if light and camera are in the same direction. Mitsuba evaluates the BRDF."""
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +11,7 @@ ANGLES = np.radians(np.arange(0, 76, 5))  #: between the normal and the common d
 
 
 def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
-    """Make one `cooktorrance` BSDF of V materials. Its parameters are textures with V pixels in a row.
+    """Make one `cooktorrance` BSDF for V materials. Each parameter is a texture of 1 × V pixels, one for each material.
 
     `material`: a dict from names of parameters to arrays (V, 3) or (V,).
     """
@@ -23,9 +23,10 @@ def bsdf_of(material: dict[str, np.ndarray]) -> mi.BSDF:
 
 
 def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
-    """Return the BRDFs (count, angles, 3) [1/sr] at the `ANGLES`.
+    """Return BRDF values (count, angles, 3) [1/sr] of `count` materials, for light and camera in the same direction.
 
-    `bsdf`: BSDF of `count` materials, as `bsdf_of` makes it.
+    The angles between this direction and the normal are `ANGLES`, 0° to 75°. `bsdf`: textures of its parameters have
+    one pixel for each material, in a row.
     """
     angle, k = np.tile(ANGLES, count), np.repeat(np.arange(count), len(ANGLES))
     si = dr.zeros(mi.SurfaceInteraction3f, len(angle))
@@ -37,9 +38,10 @@ def brdf_slices(bsdf: mi.BSDF, count: int) -> np.ndarray:
 
 
 def is_second_material(config: SynthesizeConfig, bounds: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return which points (P, 3) near the true object have its second material: (P,) bool.
+    """Test at points (P, 3) of an object whether it has its second material there. Returns (P,) bool.
 
-    `bounds` (2, 3): lowest and highest corner of the object.
+    `config`: the options with which the object was made: its pattern of two materials. `bounds` (2, 3): lowest and
+    highest corner of the true object. Points may be slightly off its surface.
     """
     edge = 1e-4 * (bounds[1] - bounds[0])  # outside the bounds the pattern would repeat
     inside = np.clip(points, bounds[0] + edge, bounds[1] - edge)

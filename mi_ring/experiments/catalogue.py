@@ -33,15 +33,18 @@ ListRuns = Callable[[ExperimentOptions], list[Run]]
 
 
 def each_dataset(**fields: Any) -> ListRuns:
-    """Return a function that lists one run for each dataset. `fields`: fields of these `Run`."""
+    """Return a function that lists one run for each dataset.
+
+    `fields`: fields of the class `Run` that all these runs get.
+    """
     return lambda options: [Run(d.name, d, {"capture": d.name}, **fields) for d in datasets(options)]
 
 
 def each_setting(label: str, settings: dict[Any, dict[str, Any]], quick: Sequence[Any] = ()) -> ListRuns:
-    """Return a function that lists one run for each dataset and each value of a label.
+    """Return a function that lists one run for each dataset and each setting.
 
-    `settings`: a dict from values of the label to fields of `Config`. `quick`: the values that --quick uses; empty:
-    all.
+    `label`: name of the table's column that says which setting a run has. `settings`: a dict from the values in this
+    column to changed fields of `Config`. `quick`: the values to use with --quick; empty: all.
     """
 
     def list_runs(options: ExperimentOptions) -> list[Run]:
@@ -53,9 +56,9 @@ def each_setting(label: str, settings: dict[Any, dict[str, Any]], quick: Sequenc
 
 
 def table2(options: ExperimentOptions) -> list[Run]:
-    """List the runs: one for each object of DiLiGenT-MV that is in the paper or in DATA.
+    """List one run for each object of DiLiGenT-MV that is in the paper or in DATA.
 
-    The run of an object that is not in DATA will fail. Raises InputError if DATA is not the folder of DiLiGenT-MV.
+    If an object is not in DATA, its run will fail. Raises InputError if DATA is not the folder of DiLiGenT-MV.
     """
     require_no_materials(options)
     if len(options.data) != 1:
@@ -91,7 +94,10 @@ def table3(options: ExperimentOptions) -> list[Run]:
 
 
 def specularity(options: ExperimentOptions) -> list[Run]:
-    """Plan fits of one mesh with materials from matt to glossy: one run for each material in `options`."""
+    """List one run for each material in `options`, or for three materials from matt to glossy.
+
+    All have the same mesh.
+    """
     mesh = one_mesh(options)
     materials = options.materials or (GLOSSY[::2] if options.quick else GLOSSY)
     names = [short_name(material) for material in materials]
@@ -104,7 +110,10 @@ def specularity(options: ExperimentOptions) -> list[Run]:
 
 
 def stripes(options: ExperimentOptions) -> list[Run]:
-    """List one run: a mesh with stripes of two materials. Raises InputError if two materials are not given."""
+    """List one run: a mesh with stripes of two materials. Raises InputError if other than two materials are given.
+
+    Without materials in `options`, two default materials are used.
+    """
     mesh, materials = one_mesh(options), options.materials or STRIPED
     if len(materials) != 2:
         raise InputError(f"--materials: are {len(materials)}, stripes need two")
@@ -127,7 +136,10 @@ def views(options: ExperimentOptions) -> list[Run]:
 
 
 def swap(options: ExperimentOptions) -> list[Run]:
-    """List one run for each dataset. Each fit starts from a sphere. Raises InputError for fewer than two datasets."""
+    """List one run for each dataset. All fits start from a sphere, so that their materials can be exchanged.
+
+    Raises InputError for fewer than two datasets.
+    """
     if not options.data:
         require_no_materials(options)
     found = datasets(options)
@@ -139,7 +151,10 @@ def swap(options: ExperimentOptions) -> list[Run]:
 
 
 def single(options: ExperimentOptions) -> list[Run]:
-    """List one run for each object of DiLiGenT. All photographs of an object are from one camera."""
+    """List one run for each .npz file in DATA: an object of DiLiGenT, photographed by one camera under many lights.
+
+    Raises InputError if DATA is empty or a file is wrong.
+    """
     require_no_materials(options)
     if not options.data:
         raise InputError("DATA: single needs .npz files of DiLiGenT's views from one side, as docs/how-to/paper.md "

@@ -1,4 +1,4 @@
-"""Datasets of experiments: captures with ground truth, from the user, path traced, converted or derived."""
+"""Datasets of experiments: captures with a known true surface. Users give them, or experiments make them."""
 
 import json
 import shutil
@@ -30,22 +30,22 @@ WANTED = "the folder of a capture with scene.xml and truth/mesh.ply, or its scen
 
 @dataclass(frozen=True)
 class Dataset:
-    """A capture with ground truth. `prepare` writes its files, if a subclass makes them."""
+    """A capture with its true surface. Its method `prepare` writes the files, if they are not the user's."""
 
     name: str
     scene: Path  #: scene file
     truth: Path  #: folder with mesh.ply and, perhaps, scene.xml of novel views
 
     def prepare(self) -> None:
-        """Write the files that are missing or outdated. Only one process does this at a time.
+        """Write the files of the dataset if they are missing or outdated. If another process does it, wait for it.
 
-        In this base class, the files must exist already. Raises InputError if a file is missing or cannot be written.
+        The files of a user's capture are not written. Raises InputError if a file is missing or cannot be written.
         """
         require_file(self.scene, WANTED)
 
     @property
     def truth_files(self) -> list[Path]:
-        """Files with the ground truth, with which a fit is compared. Some may be missing."""
+        """Files of the ground truth: the true mesh and the scene file of novel views. Some may be missing."""
         return [self.truth / "mesh.ply", self.truth / "scene.xml"]
 
     @property
@@ -56,9 +56,10 @@ class Dataset:
 
 
 def given(path: Path) -> Dataset:
-    """Return the dataset of a user's capture. `path`: its folder or its scene file.
+    """Return the dataset of a user's capture. `path`: the folder of the capture, or its scene file.
 
-    Raises InputError if the scene file or the true mesh is missing.
+    The true mesh is truth/mesh.ply beside the scene file NAME.xml, or NAME/truth/mesh.ply. Raises InputError if the
+    scene file or the mesh is missing.
     """
     scene = path / "scene.xml" if path.is_dir() else path
     require_file(scene, WANTED)
@@ -71,9 +72,9 @@ def given(path: Path) -> Dataset:
 
 
 def default_dataset(captures: Path) -> Dataset:
-    """Return the default dataset: pot2 in a checkout of the repository, otherwise the pot of `mi-ring example`.
+    """Return the dataset pot2 if this is a checkout of the repository, otherwise the pot of `mi-ring example`.
 
-    `captures`: folder in which that pot will be written.
+    `captures`: folder in which `prepare` will write the pot of `mi-ring example`.
     """
     return given(POT2) if POT2.is_file() else ExamplePot.of(captures / "example")
 
@@ -83,11 +84,17 @@ Cached = TypeVar("Cached", bound="CachedDataset")
 
 @dataclass(frozen=True)
 class CachedDataset(Dataset):
-    """A dataset that is written to a folder of its own. If its sources change, it is written again."""
+    """Base class of datasets that are written to a folder.
+
+    If the files that they are made from change, it is written again.
+    """
 
     @classmethod
     def of(cls: type[Cached], folder: Path, *fields: Any) -> Cached:
-        """Return the dataset in `folder`. Nothing is written yet. `fields`: the fields that the subclass adds."""
+        """Return the dataset in `folder`. Nothing is written yet.
+
+        `fields`: values of the fields that the subclass adds.
+        """
         return cls(folder.name, folder / "scene.xml", folder / "truth", *fields)
 
     def prepare(self) -> None:
@@ -101,11 +108,17 @@ class CachedDataset(Dataset):
                     shutil.rmtree(folder, ignore_errors=True)  # outdated or incomplete
 
     def origin(self) -> dict[str, Any]:
-        """Return the sources of the dataset and their modification times, as JSON values."""
+        """Return what the dataset is made from, such as files with their modification times, as JSON values.
+
+        If this changes, the dataset is written again.
+        """
         raise NotImplementedError
 
     def write(self, folder: Path) -> None:
-        """Write the dataset to an empty folder. Afterwards, `prepare` renames this folder to `self.scene.parent`."""
+        """Write the dataset to `folder`, which is empty and temporary.
+
+        The method `prepare` then moves it to its place.
+        """
         raise NotImplementedError
 
 
@@ -152,7 +165,10 @@ class Synthetic(Dataset):
 
 @dataclass(frozen=True)
 class Derived(CachedDataset):
-    """A dataset that uses the photographs and the ground truth of another one. It has a scene file of its own."""
+    """Base class of datasets that change the scene file of another dataset, `source`.
+
+    They share its photographs and its ground truth.
+    """
 
     source: Dataset
 
@@ -175,9 +191,9 @@ class Derived(CachedDataset):
         write_file(folder / "scene.xml", self.changed(root))
 
     def changed(self, root: ElementTree.Element) -> bytes:
-        """Return the content of the dataset's scene file.
+        """Return the content of this dataset's scene file.
 
-        `root`: XML of the source's scene file, in which file names are already adjusted. This method may change `root`.
+        `root`: XML of the source's scene file, with file names relative to the new file. The method may change `root`.
         """
         raise NotImplementedError
 
@@ -199,7 +215,7 @@ class Subset(Derived):
 
 @dataclass(frozen=True)
 class PerturbedCameras(Derived):
-    """A capture with wrong cameras; see `miscalibrated`. Its scene file does not say that the cameras are exact."""
+    """A capture with random errors of its camera poses. Its scene file does not say that the cameras are exact."""
 
     degrees: float  #: standard deviation of rotations [deg] and of positions [% of the distance]
     seed: int
@@ -216,7 +232,7 @@ class PerturbedCameras(Derived):
 
 @dataclass(frozen=True)
 class DiligentObject(CachedDataset):
-    """An object of DiLiGenT-MV. It is converted to a scene file."""
+    """An object of the data set DiLiGenT-MV, converted to a scene file."""
 
     source: Path  #: its folder in DiLiGenT-MV
     fill_holes: bool = False  #: in its masks

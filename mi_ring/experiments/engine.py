@@ -1,4 +1,4 @@
-"""Runs an experiment: prepares datasets, fits, and measures. Writes table and figure after each run."""
+"""Runs an experiment: prepares datasets, fits them, and measures the fits. Writes table and figure after each run."""
 
 import io
 import json
@@ -33,11 +33,11 @@ RETRIES = 1  #: of a fit that is killed without making progress
 def run_experiment(
     experiment: Experiment, options: ExperimentOptions, out: Path, only: Collection[str] = (), command_line: str = ""
 ) -> int:
-    """Perform all runs, or only those named in `only`. Returns the number of failed runs.
+    """Perform all runs of an experiment, or only those named in `only`. Returns the number of failed runs.
 
-    If a run fails, the others go on. The results of the runs are in `out`/runs/. After each run, table.csv, table.md
-    and figure.png are written. If the files and settings of a run have not changed, the results of this run are kept.
-    Raises InputError before the first run if options are wrong.
+    If a run fails, the others continue. Results are written to `out`/runs/. After each run, table.csv, table.md and
+    figure.png are written to `out`. A finished run is not repeated if its files and settings have not changed.
+    `command_line`: text for table.md. Raises InputError before the first run if options are wrong.
     """
     runs = experiment.runs(options)
     if unknown := set(only) - {run.name for run in runs}:
@@ -58,9 +58,10 @@ def run_experiment(
 
 
 def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True) -> Outcome:
-    """Fit and measure a run. If an error occurs, returns an outcome that says why the run failed.
+    """Fit a run and measure the fit, which is written to `out`/runs/.
 
-    If `wanted` is False, nothing is fitted, and only an existing fit is measured.
+    Returns the numbers, or the reason why the run failed. `wanted`: False fits nothing, and only measures a fit that is
+    there already.
     """
     try:
         if wanted:
@@ -95,9 +96,9 @@ def try_run(run: Run, options: ExperimentOptions, out: Path, wanted: bool = True
 
 
 def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Return the rows of a finished fit, and save them in its folder.
+    """Measure a finished fit. Returns its rows of the table, and saves them in `folder`, the results folder of the fit.
 
-    If the files have not changed since the last time, the saved rows are read instead.
+    If the files have not changed since the last time, the saved rows are returned.
     """
     measure = run.measure or evaluated
     of = {"measure": measure.__name__, "spp": options.spp, "written": modified(folder / "ring.pt"),
@@ -111,9 +112,10 @@ def measure_run(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]
 
 
 def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptions) -> Record:
-    """Fit in this process. Measures the errors of normals and depth `POINTS` times during the fit.
+    """Fit a run in this process. Errors of normals and depth are measured several times during the fit.
 
-    The errors are written to `COURSE` in the results folder. Returns the record of the finished fit.
+    They are written to course.json in the results folder. `fingerprint`: hash of the job's input. Returns the record of
+    the finished fit.
     """
     rows: list[Row] = []
 
@@ -137,7 +139,8 @@ def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptio
 def write_table_and_figure(experiment: Experiment, outcomes: list[Outcome], out: Path, command_line: str) -> None:
     """Write table.csv, table.md and figure.png to the folder `out`.
 
-    If no run is finished, or if drawing fails, figure.png is removed.
+    `outcomes`: of all runs, also those that are not done. `command_line`: text for table.md. If no run is finished, or
+    if drawing fails, figure.png is removed.
     """
     rows = table_of(experiment, outcomes)
     names = headings(experiment, outcomes, rows)

@@ -1,4 +1,4 @@
-"""An experiment: a list of runs, each of which fits a dataset, and the table and figure of their results."""
+"""An experiment: a list of runs, and how a table and a figure show their results. Each run fits a dataset."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,12 +35,12 @@ class ExperimentOptions:
 
     @property
     def size(self) -> str:
-        """Size of the captures that experiments make: quick, fast or full."""
+        """Size of the captures that experiments make: "quick", "fast" or "full"."""
         return "quick" if self.quick else "fast" if self.preset == "fast" else "full"
 
     @property
     def captures(self) -> Path:
-        """Folder of the captures that experiments make."""
+        """Folder for the captures that experiments make."""
         return self.out / "captures" / self.size
 
     @property
@@ -63,11 +63,11 @@ class Run:
     watched: bool = False  #: measure the surface during the fit, too; such a fit cannot be resumed
 
     def config(self, options: ExperimentOptions) -> Config:
-        """Return the settings of the fit. Raises InputError for values that `Config` rejects."""
+        """Return the settings of the fit. Raises InputError if a setting is invalid."""
         return Config.preset(options.preset, **self.settings(options))
 
     def settings(self, options: ExperimentOptions) -> dict[str, Any]:
-        """Return all settings that differ from the preset: a dict from fields of `Config` to values."""
+        """Return the settings that differ from the preset: a dict from fields of `Config` to values."""
         return {**(QUICK if options.quick else {}), **self.changes}
 
     def fit_options(self, options: ExperimentOptions) -> tuple[str, ...]:
@@ -111,7 +111,7 @@ class Experiment:
     one_seed: bool = False  #: whether only one seed is allowed, because its rows have no mean
 
     def runs(self, options: ExperimentOptions) -> list[Run]:
-        """Return all runs. Each run is repeated with each seed.
+        """Return all runs, repeated with each seed of the options.
 
         Raises InputError if DATA or --materials are wrong, or if two runs would have the same name.
         """
@@ -126,9 +126,9 @@ class Experiment:
 
 
 def seeded(runs: Sequence[Run], seeds: Sequence[int]) -> list[Run]:
-    """Repeat each run with each seed. A run that sets its own seed is not repeated.
+    """Repeat each run with each seed. A run whose settings contain a seed is not repeated.
 
-    The name of a run does not depend on the other seeds.
+    The seed is added to the names of the runs, unless it is 0. It is added to their labels if there are several seeds.
     """
     result = []
     for run in runs:

@@ -1,4 +1,4 @@
-"""Measures of finished fits: functions of (run, results folder, options) that return rows of the table."""
+"""Measures of finished fits: functions that return rows of an experiment's table."""
 
 import json
 from pathlib import Path
@@ -35,9 +35,11 @@ SLICE_LEVEL = 3  #: subdivisions: at these vertices materials are compared
 def evaluated(
     run: Run, folder: Path, options: ExperimentOptions, align: str | None = None, seen: bool = False
 ) -> list[Row]:
-    """Return one row: the numbers of `mi-ring evaluate`, and the duration of the fit [s].
+    """Compare a fit with the truth.
 
-    Crossing and inverted triangles are in % of all triangles. `align`, `seen`: as for `evaluate`.
+    Returns a list of one row: the numbers of `mi-ring evaluate`, and the fit's time [s]. `folder`: the results folder.
+    Crossing and inverted triangles are in % of all triangles. `align`: "rigid" or "similarity" first aligns the truth
+    with the fit; None: no alignment. `seen`: True compares only parts of the surfaces that a photograph shows.
     """
     truth, novel = run.dataset.truth / "mesh.ply", run.dataset.truth / "scene.xml"
     numbers = evaluate(folder, truth, novel if novel.is_file() else None, options.spp, seen, align)
@@ -50,7 +52,7 @@ def evaluated(
 
 
 def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return the share of the triangles (F, 3) that cross others [%]. It is exact if libigl is installed."""
+    """Return the share of triangles (F, 3) that cross another triangle [%]. It is exact if libigl is installed."""
     count = exactly_crossing if installed("igl") else crossing_triangles
     return 100 * float(np.mean(count(vertices, faces)))
 
@@ -58,7 +60,11 @@ def crossing(vertices: np.ndarray, faces: np.ndarray) -> float:
 def surface_errors(
     run: Run, capture: Capture, ring: FittedObject, s: Tensor, faces: np.ndarray
 ) -> tuple[np.ndarray, Row]:
-    """Return (vertices (V, 3), row with errors) of an object's surface at domain points `s` (V, 3)."""
+    """Compare an object's surface with the true mesh of a run. Returns (vertices (V, 3), row with errors).
+
+    `capture`: the cameras. `s` (V, 3): points of the domain. `faces` (F, 3): triangles of these points. Errors of
+    normals are in degrees, errors of depth in % of the diagonal of the true bounding box.
+    """
     mesh, truth = load_true_mesh(run.dataset.truth / "mesh.ply")
     with torch.no_grad():
         vertices = ring.surface(s.to(ring.center.device)).cpu().numpy()
@@ -66,9 +72,10 @@ def surface_errors(
 
 
 def in_millimetres(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Return one row: the numbers of `evaluated`, but only where photographs show the surface.
+    """Compare a fit with the truth where photographs show the surface. Returns a list of one row.
 
-    Depth and Chamfer distance are also given in mm.
+    It has the numbers of `mi-ring evaluate`; depth and Chamfer distance are also given in mm. `folder`: the results
+    folder.
     """
     percent = load_true_mesh(run.dataset.truth / "mesh.ply")[0].scale / 100
     (row,) = evaluated(run, folder, options, seen=True)
@@ -76,9 +83,10 @@ def in_millimetres(run: Run, folder: Path, options: ExperimentOptions) -> list[R
 
 
 def aligned(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Return one row: the numbers of `evaluated` after rigid alignment, and `turned`.
+    """Align the truth rigidly with a fit, and compare them. Returns a list of one row.
 
-    `turned` is the root mean square of the cameras' rotation errors [°].
+    It has the numbers of `mi-ring evaluate`, and `turned`: root mean square of the cameras' rotation errors [°].
+    `folder`: the results folder.
     """
     (row,) = evaluated(run, folder, options, align="rigid")
     exact = run.dataset.source if isinstance(run.dataset, PerturbedCameras) else run.dataset
@@ -86,14 +94,20 @@ def aligned(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
 
 
 def rotation_error(a: Path, b: Path) -> float:
-    """Return the root mean square angle [°] between the cameras of two scenes, after removing a common rotation."""
+    """Return the root mean square angle [°] between corresponding cameras of two scene files.
+
+    A rotation that all cameras share is removed first.
+    """
     first, second = ([s.camera.to_world[:3, :3] for s in load_capture(x, images=False).shots] for x in (a, b))
     between = Rotation.from_matrix([x @ y.T for x, y in zip(first, second, strict=True)])
     return float(np.degrees(np.sqrt(np.mean((between * between.mean().inv()).magnitude() ** 2))))
 
 
 def by_level(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Sample one fit at each of the `LEVELS`. Returns a row of numbers for each level."""
+    """Compare meshes of one fit with the truth at levels 3 to 7. Returns one row for each level.
+
+    `folder`: the results folder.
+    """
     ring, capture = load_fit(folder), load_capture(run.dataset.scene, images=False)
     rows = []
     for level in LEVELS:
@@ -105,14 +119,15 @@ def by_level(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
 
 
 def course(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Return the rows that `fit_and_watch` has written during the fit."""
+    """Return the rows that were measured during the fit and written to course.json in `folder`, the results folder."""
     return json.loads((folder / COURSE).read_text())
 
 
 def single_view_normals(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Return one row: errors of the normals that the camera of a `SingleView` sees.
+    """Measure the errors of the normals that the one camera of a dataset sees. Returns a list of one row.
 
-    Where the camera misses the fitted surface, the error is 90°.
+    The row has their mean and median [°], the share of pixels at which the camera misses the fitted surface [%], and
+    the fit's time [s]. At these pixels the error is 90°. `folder`: the results folder.
     """
     angles, missed = normal_errors(run, folder)
     known = np.isfinite(angles)
@@ -123,9 +138,10 @@ def single_view_normals(run: Run, folder: Path, options: ExperimentOptions) -> l
 
 
 def normal_errors(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays (H, W) for a `SingleView`: errors of normals [°], and whether the pixel misses the surface.
+    """Return two arrays (H, W) for the one camera of a run: errors of normals [°]; True where it misses the surface.
 
-    The error is NaN where the true normal is unknown.
+    The error is NaN where the true normal is unknown, and 90° where the surface is missed. `folder`: the results
+    folder.
     """
     assert isinstance(run.dataset, SingleView)
     data = run.dataset.read()
@@ -139,9 +155,10 @@ def normal_errors(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_slices(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]:
-    """Return one row: the numbers of `evaluated` and of `compare_slices`.
+    """Compare a fit and its BRDF with the truth. Returns a list of one row.
 
-    If the object has one material, slices.npz is written to `folder` for the figure.
+    It has the numbers of `mi-ring evaluate`, and errors of BRDF values for light and camera in one direction. If the
+    object has one material, slices.npz is written to `folder`, the results folder, for the figure.
     """
     (row,) = evaluated(run, folder, options)
     found, truth, other = slices_of(run, folder)
@@ -151,11 +168,11 @@ def with_slices(run: Run, folder: Path, options: ExperimentOptions) -> list[Row]
 
 
 def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | None) -> Row:
-    """Return a row with the errors of BRDF slices (V, angles, 3) at V points of the surface.
+    """Return a row with the errors of fitted BRDF values, `found`, at V points of the surface.
 
-    `slice_error`: abs(found − truth) / max(truth, `BLACK`), mean over angles and channels, median over points [%].
-    `right_material`: share of the points [%] whose slice is nearer to the true slice than to that of the `other`
-    material. Distances are between logarithms of slices.
+    All arrays: (V, angles, 3). `slice_error`: abs(found − truth) / max(truth, `BLACK`), mean over angles and channels,
+    median over points [%]. `other`: values of the material that a point does not have, or None. `right_material`: share
+    of points [%] whose `found` is nearer to `truth` than to `other`, by distances between logarithms.
     """
     error = (np.abs(found - truth) / np.maximum(truth, BLACK)).mean((1, 2))
     row = {"slice_error": 100 * float(np.median(error))}
@@ -167,9 +184,10 @@ def compare_slices(found: np.ndarray, truth: np.ndarray, other: np.ndarray | Non
 
 
 def slices_of(run: Run, folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return BRDF slices (V, angles, 3) [1/sr] at V points of the surface: (fitted, true, of the other material).
+    """Return BRDF values at V points of the surface, for light and camera in one direction: (fitted, true, wrong).
 
-    If the object has one material, the last is None.
+    Each is an array (V, angles, 3) [1/sr]. Wrong values are those of the material that a point does not have; None if
+    the object has one material. `folder`: the results folder.
     """
     assert isinstance(run.dataset, Synthetic)
     config = run.dataset.config

@@ -30,13 +30,13 @@ Plot = Callable[[list[Outcome]], Figure]
 def title_of(outcome: Outcome, but: str = "") -> str:
     """Return the labels of a run as text, without the label `but`: for example "bunny, views 5".
 
-    A number has the name of its label before it. A word does not.
+    The name of a label is before its value if the value is a number.
     """
     return ", ".join(v if isinstance(v, str) else f"{k} {v}" for k, v in outcome.run.labels.items() if k != but)
 
 
 def of_finished(plot: Plot) -> Plot:
-    """Decorate a plot. The plot then gets only the finished runs. A line below the figure names the failed runs."""
+    """Decorator of a plot. The plot then gets only the finished runs. A line below the figure names the failed runs."""
 
     @functools.wraps(plot)
     def annotated(outcomes: list[Outcome]) -> Figure:
@@ -49,9 +49,9 @@ def of_finished(plot: Plot) -> Plot:
 
 
 def bars(*columns: tuple[str, str]) -> Plot:
-    """Return a plot with a bar chart for each column (name, heading).
+    """Return a function that draws a bar chart for each of the `columns`, given as (name in the table, heading).
 
-    Each run has a bar. If its number is missing, a word is in its place.
+    Each run has one bar. If a run has no number, the chart shows a word instead, such as "failed".
     """
 
     def plot(outcomes: list[Outcome]) -> Figure:
@@ -71,7 +71,11 @@ def bars(*columns: tuple[str, str]) -> Plot:
 
 
 def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) -> Plot:
-    """Return a plot of column y over column x. Each is (name, heading). Runs that differ only in x share a curve."""
+    """Return a function that draws one column of the table over another.
+
+    `x`, `y`: (name in the table, heading) of both. Runs that differ only in x are one curve. `logarithmic`: the x axis
+    is logarithmic.
+    """
 
     @of_finished
     def plot(outcomes: list[Outcome]) -> Figure:
@@ -93,7 +97,7 @@ def curves(x: tuple[str, str], y: tuple[str, str], logarithmic: bool = False) ->
 
 @of_finished
 def slices(outcomes: list[Outcome]) -> Figure:
-    """Draw the true and the fitted median BRDF for each run.
+    """Draw the true and the fitted BRDF for each run, as medians over the surface.
 
     The x axis is the angle between the normal and the common direction of light and camera.
     """
@@ -110,7 +114,7 @@ def slices(outcomes: list[Outcome]) -> Figure:
 
 @of_finished
 def pictures(outcomes: list[Outcome]) -> Figure:
-    """Draw for each run its first photograph, the prediction of the fit, and the error of its normals."""
+    """Draw a row for each run: its first photograph, a rendering of the fitted object, and a map of normal errors."""
     rows = []
     for outcome in outcomes:
         folder, dataset = outcome.folder, outcome.run.dataset
@@ -131,7 +135,7 @@ def pictures(outcomes: list[Outcome]) -> Figure:
 
 @of_finished
 def swapped(outcomes: list[Outcome]) -> Figure:
-    """Draw every shape with every material. Shapes are rows, materials are columns."""
+    """Draw the shape of each run with the material of each run. Shapes are rows, materials are columns."""
     rows = []
     for shape in outcomes:
         cells = []
@@ -145,9 +149,9 @@ def swapped(outcomes: list[Outcome]) -> Figure:
 
 
 def grid(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[str]) -> Figure:
-    """Draw a table of pictures (H, W, 3) and error maps (H, W) [deg].
+    """Draw a table of images. An array (H, W, 3) is an sRGB picture, an array (H, W) is a map of errors [deg].
 
-    `rows`: (title, pictures) of each row. `heads`: titles of the columns.
+    `rows`: (title, images) of each row. `heads`: titles of the columns.
     """
     figure = Figure(figsize=(2.6 * len(heads), 2.7 * len(rows)), layout="constrained")
     for line, (title, images) in zip(figure.subplots(len(rows), len(heads), squeeze=False), rows):
@@ -161,7 +165,7 @@ def grid(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[str]) -> 
 
 
 def predicted(outcome: Outcome, ring: FittedObject) -> tuple[np.ndarray, int]:
-    """Render the first photograph of a run. Returns (sRGB picture (H, W, 3), factor).
+    """Render the first photograph of a run from its fit, `ring`. Returns (sRGB picture (H, W, 3), factor).
 
     The photograph is `factor` times as large as the picture.
     """

@@ -1,4 +1,4 @@
-"""Published numbers. Our tables show them beside our own numbers."""
+"""Published numbers of the paper and others. Our tables show them beside our own numbers."""
 
 PAPER = "paper"  #: Cheng et al., One Ring to Rule Them All, ICCV 2021
 

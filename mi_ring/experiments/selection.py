@@ -21,11 +21,11 @@ SIZES: dict[str, dict[str, Any]] = {
 
 
 def datasets(options: ExperimentOptions) -> list[Dataset]:
-    """Return a dataset for each capture and each mesh in DATA. Without DATA, return the default dataset.
+    """Return a dataset for each capture and each mesh in DATA. If DATA is empty, return the default dataset.
 
-    Nothing is rendered yet: `prepare` of the dataset path traces a mesh. The first mesh gets the first of --materials,
-    the second mesh the second, and so on. If there are fewer materials than meshes, the next mesh gets the first
-    material again. Raises InputError if DATA or --materials are wrong.
+    Photographs of a mesh are path traced later, by the dataset's method `prepare`. The first mesh gets the first of
+    --materials, the second mesh the second, and so on. If there are fewer materials than meshes, the materials are
+    repeated. Raises InputError if DATA or --materials are wrong.
     """
     meshes = [path for path in options.data if path.suffix.lower() in MESHES]
     if options.materials and not meshes:
@@ -51,7 +51,8 @@ def path_traced(
 ) -> Synthetic:
     """Return a dataset of path-traced photographs of a mesh, as in the paper. Nothing is rendered yet.
 
-    If `mesh` is None, it is the pot of `mi-ring example`. `more`: other options of `mi-ring synthesize`.
+    `mesh`: None for the pot of `mi-ring example`. `material`: as in `mi-ring synthesize`; None: its default. `name`:
+    name of the dataset; empty: the name of the mesh. `more`: other options of `mi-ring synthesize`.
     """
     settings: dict[str, Any] = {"format": "png8", "cameras": "free", **SIZES[options.size], **more}
     config = SynthesizeConfig(Path(), Path(), material, **settings)
@@ -63,15 +64,15 @@ def path_traced(
 
 
 def require_no_materials(options: ExperimentOptions) -> None:
-    """Raise InputError if --materials is given. Experiments that do not use materials call this function."""
+    """Raise InputError if --materials is given. This is for experiments that do not use materials."""
     if options.materials:
         raise InputError("--materials: apply to meshes, which this experiment does not use; leave them out")
 
 
 def one_mesh(options: ExperimentOptions) -> Path | None:
-    """Return the mesh in DATA, or None if DATA is empty.
+    """Return the one mesh in DATA, or None if DATA is empty.
 
-    Raises InputError if DATA is anything else than one mesh, or if a material is textured.
+    Raises InputError if DATA is anything else than one mesh, or if one of --materials varies over the surface.
     """
     for material in options.materials:
         load_material(material, "--materials", coloured=True)
@@ -85,7 +86,7 @@ def one_mesh(options: ExperimentOptions) -> Path | None:
 
 
 def short_name(material: str) -> str:
-    """Return a short name of a material for file names. It consists of the plugin or the file, and the roughness."""
+    """Return a short name of a material for file names: the name of its BSDF plugin or its file, and its roughness."""
     if ".npz:" in material:
         return material.rpartition(":")[2]
     words = material.split()

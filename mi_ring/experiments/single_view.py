@@ -1,4 +1,4 @@
-"""A dataset of DiLiGenT's photographs, all of which are from one camera."""
+"""A dataset of DiLiGenT: photographs of an object by one camera under many lights."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,17 +25,20 @@ MANUAL = "docs/how-to/paper.md"  #: describes these arrays
 
 @dataclass(frozen=True)
 class SingleView(CachedDataset):
-    """DiLiGenT's photographs of one real camera under 96 lights, in an .npz file.
+    """DiLiGenT's photographs of an object by one real camera under 96 lights, in an .npz file.
 
     The file has these arrays: `mask` (H, W), `pixels_uint16` (lights, pixels of the mask, 3), `light_dir` (lights, 3; x
     right, y up, z to the viewer), `light_int` (lights, 3), `normal_gt` (H, W, 3; same axes, 0 where unknown) and `K`
-    (3, 3).
+    (3, 3), the camera's intrinsics.
     """
 
     file: Path
 
     def read(self) -> dict[str, np.ndarray]:
-        """Read the arrays. Returns a dict by name. Raises InputError if an array is missing or has another shape."""
+        """Read the .npz file. Returns a dict from names to arrays.
+
+        Raises InputError if an array is missing or has another shape or type than it should have.
+        """
         require_file(self.file, "an .npz of DiLiGenT's photographs from one side")
         arrays = load_npz(self.file)
         for name, dimensions in DIMENSIONS.items():

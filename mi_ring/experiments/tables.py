@@ -13,9 +13,9 @@ OURS = "ours"  #: value of the column `by`
 
 
 def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Return the rows of the table: our rows, then their means. A published row is below our rows with the same labels.
+    """Return the rows of the table: a row for each row of our results, then means, and published rows.
 
-    If a run has no numbers, its entry `state` says why.
+    A published row is placed below our rows with the same labels. If a run has no numbers, its entry `state` says why.
     """
     rows: list[Row] = []
     for outcome in outcomes:
@@ -30,7 +30,7 @@ def table_of(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
-    """Return means of rows: over seeds, and over both the seeds and the label `mean_over`.
+    """Return rows of means, over seeds and over the values of the label `mean_over` of the experiment.
 
     Only finished runs count. A mean is given only for numbers that all rows have.
     """
@@ -52,9 +52,9 @@ def means(experiment: Experiment, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def headings(experiment: Experiment, outcomes: Sequence[Outcome], rows: Sequence[Row]) -> dict[str, str]:
-    """Return the headings of the table's columns: a dict by name. Order: labels, `by`, numbers, `state`.
+    """Return a dict from the names of the table's columns to their headings. Columns without content are left out.
 
-    Empty columns are left out.
+    The order is: labels of runs, `by` (whose numbers they are), numbers, `state`.
     """
     labels = [label for labelled in (*(o.run.labels for o in outcomes), *experiment.published) for label in labelled]
     own = {label: label for label in labels if label not in experiment.columns and label != "by"}
@@ -63,7 +63,10 @@ def headings(experiment: Experiment, outcomes: Sequence[Outcome], rows: Sequence
 
 
 def csv_text(names: Mapping[str, str], rows: Sequence[Row]) -> str:
-    """Return the table as CSV, with all digits. `names`: headings from `headings`."""
+    """Return the table as CSV, with all digits of the numbers.
+
+    `names`: a dict from the names of columns to their headings.
+    """
     box = io.StringIO()
     writer = csv.DictWriter(box, list(names), extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -72,7 +75,11 @@ def csv_text(names: Mapping[str, str], rows: Sequence[Row]) -> str:
 
 
 def markdown(experiment: Experiment, names: Mapping[str, str], rows: Sequence[Row], command_line: str) -> str:
-    """Return the table as Markdown. Above the table is its subject. Below it are command line, computer and date."""
+    """Return the table as Markdown.
+
+    Above it is the subject of the experiment, below it command line, computer and date. `names`: a dict from the names
+    of columns to their headings.
+    """
 
     def cell(name: str, value: Any) -> str:
         if isinstance(value, float) and name in experiment.columns:

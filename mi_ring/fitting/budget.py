@@ -20,10 +20,10 @@ Costs = dict[tuple[int, int], float]  #: seconds of an iteration by level and wi
 
 
 def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = int) -> Costs:
-    """Measure how long an iteration takes at each mesh level and photograph width of the `stages`.
+    """Measure how long an iteration takes at each mesh level and photograph width of the `stages` of a fit.
 
-    A trial fit makes two iterations at each, and the second one is timed; `fit` does not change. Returns seconds by
-    (level, width). If `interrupted()` returns a signal number, it stops and returns {}.
+    A copy of `fit` makes two iterations at each, and the second one is timed; `fit` does not change. Returns a dict
+    from (level, width) to seconds. If `interrupted()` returns a signal number other than 0, the result is {}.
     """
     print("Measuring how long iterations take, to say how long is left", flush=True)
     trial = Fit(fit.problem.given, fit.problem.config, terms=fit.loss.terms, state=fit.state())
@@ -47,24 +47,25 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
 
 
 def replan(fit: Fit, config: Config) -> None:
-    """Give the settings `config` to a fit that has made no iteration yet.
+    """Give new settings, `config`, to a fit that has made no iteration yet. `fit` is changed in place.
 
-    Only these may differ from its present settings: stages, iterations, mesh level and regulariser.
+    Only these settings may differ from the old ones: stages, iterations, mesh level and regulariser.
     """
     fit.problem = fit.optimisation.problem = replace(fit.problem, config=config)
     fit.ring.subdivisions, fit.schedule = config.subdivisions, fit.plan(config)
 
 
 def all_stages(fit: Fit, configs: Sequence[Config]) -> list[Stage]:
-    """List the stages that this fit would have with each of the settings `configs`, one after the other."""
+    """List the stages that `fit` would have with each of the settings `configs`, all in one list."""
     return [stage for config in configs for stage in fit.plan(config).stages]
 
 
 def fitting_into(seconds: float, configs: Sequence[Settings], plan: Planner, costs: Costs) -> Settings:
-    """Choose from `configs` the settings whose fit takes about `seconds`. Returns them with other iterations.
+    """Choose from `configs` the settings whose fit takes about `seconds`.
 
-    Their number of iterations is changed so that the fit fills the time. `plan`: returns the schedule of settings.
-    `costs`: seconds per iteration, from `measure`.
+    Returns them with another number of iterations. With this number the fit fills the time. `plan`: a function from
+    settings to the schedule of their fit. `costs`: a dict from (mesh level, photograph width) to measured seconds per
+    iteration.
     """
     config = min(configs, key=lambda config: abs(math.log(seconds_of(config, plan, costs) / seconds)))
     around = seconds_around(config, plan, costs)
@@ -73,17 +74,29 @@ def fitting_into(seconds: float, configs: Sequence[Settings], plan: Planner, cos
 
 
 def fewest_seconds(configs: Sequence[Config], plan: Planner, costs: Costs) -> float:
-    """Estimate the time [s] of the shortest useful fit among `configs`. Arguments: as for `fitting_into`."""
+    """Estimate the time [s] of the shortest useful fit among the settings `configs`. Such a fit has 40 iterations.
+
+    `plan`: a function from settings to the schedule of their fit. `costs`: a dict from (mesh level, photograph width)
+    to measured seconds per iteration.
+    """
     return min(seconds_of(replace(config, iterations=FEWEST), plan, costs) for config in configs)
 
 
 def seconds_of(config: Config, plan: Planner, costs: Costs) -> float:
-    """Estimate the total time [s] of a fit: pictures before the first iteration, iterations, and results."""
+    """Estimate the total time [s] of a fit: pictures before the first iteration, iterations, and results.
+
+    `plan`: a function from settings to the schedule of their fit. `costs`: a dict from (mesh level, photograph width)
+    to measured seconds per iteration.
+    """
     iterations = sum((s.last - s.first) * costs[s.level, s.width] for s in plan(config).stages)
     return iterations + seconds_around(config, plan, costs)
 
 
 def seconds_around(config: Config, plan: Planner, costs: Costs) -> float:
-    """Estimate the time [s] that a fit takes beside its iterations: for the pictures before them and the results."""
+    """Estimate the time [s] of a fit without its iterations: for pictures before the first one, and for the results.
+
+    `plan`: a function from settings to the schedule of their fit. `costs`: a dict from (mesh level, photograph width)
+    to measured seconds per iteration.
+    """
     last = plan(config).stages[-1]
     return AROUND * costs[last.level, last.width]

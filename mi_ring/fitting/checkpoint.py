@@ -21,8 +21,8 @@ ADVICE = "run without --resume to start anew"
 def read_checkpoint(folder: Path, config: Config) -> dict:
     """Read the newest checkpoint in `folder`. If it is damaged or missing, read the previous one and print a message.
 
-    Returns the content of the checkpoint. Raises InputError if no checkpoint can be read, or if it was made with
-    settings other than `config`.
+    Returns the content of the checkpoint. `config`: the settings of the fit that is to continue. Raises InputError if
+    no checkpoint can be read, or if it was made with other settings.
     """
     path = folder / NAME
     try:
@@ -58,9 +58,9 @@ def read_checkpoint(folder: Path, config: Config) -> dict:
 
 
 def by_option(settings: dict) -> dict:
-    """Convert settings to a dictionary with one entry per command-line option.
+    """Convert settings to a dict with one entry per command-line option. Returns a new dict.
 
-    The dictionary `weights` in it is replaced by one entry `weights.NAME` for each weight of the loss.
+    Its entries `weights.NAME`, one for each weight of the loss, replace the dict `weights` in `settings`.
     """
     weights = {f"weights.{name}": value for name, value in settings["weights"].items()}
     return {name: value for name, value in settings.items() if name != "weights"} | weights
@@ -69,7 +69,7 @@ def by_option(settings: dict) -> dict:
 def require_same_files(state: dict, capture: Capture, config: Config, folder: Path) -> None:
     """Raise InputError if a file that the fit reads has changed since the checkpoint was written.
 
-    `state`: content of the checkpoint. `folder`: the results folder, for the message.
+    `state`: content of the checkpoint. `config`: settings of the fit. `folder`: the results folder, for the message.
     """
     before, now = state["files"], digests(capture, config)
     for name in sorted(before.keys() | now.keys()):
@@ -92,9 +92,10 @@ def resumed(state: dict, capture: Capture, config: Config, folder: Path) -> Fit:
 
 
 def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
-    """Write a checkpoint of `fit` into `folder`, and keep the previous checkpoint. `files`: result of `digests`.
+    """Write a checkpoint of `fit` into `folder`, and keep the previous checkpoint.
 
-    Raises InputError if the checkpoint cannot be written.
+    `files`: a dict from the names of the fit's input files to hashes of their content, to recognise changed files
+    later. Raises InputError if the checkpoint cannot be written.
     """
     state = {"format": FORMAT, "settings": fit.problem.config.settings(), "files": files, "fit": fit.state()}
     path = folder / NAME
@@ -107,7 +108,7 @@ def write_checkpoint(fit: Fit, files: dict[str, str], folder: Path) -> None:
 def digests(capture: Capture, config: Config) -> dict[str, str]:
     """Hash every file that a fit reads, except textures.
 
-    Returns hashes by file name. The names are relative to the folder of the scene file.
+    Returns a dict from file names to hashes. The names are relative to the folder of the scene file.
     """
     files = {capture.path, capture.shape.domain_file}
     files |= {file for shot in capture.shots for file in shot.files}

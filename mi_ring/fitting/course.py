@@ -23,7 +23,10 @@ class Course:
 
     @classmethod
     def of(cls, fields: dict[str, Any], iterations: int) -> "Course":
-        """Make the course of a fit of so many iterations that is to go on. Wrong fields raise errors of Python."""
+        """Make the course of a fit that continues, from the `fields` in a checkpoint. `iterations`: the planned number.
+
+        Raises TypeError, KeyError or ValueError if the fields are wrong.
+        """
         course = cls(**fields)
         if not (0 <= course.iteration <= iterations and 0 <= course.seconds < math.inf):
             raise ValueError(f"iteration {course.iteration} after {course.seconds} s")
@@ -34,7 +37,8 @@ class Course:
     def record(self, it: Iteration, learning_rate: float, regulariser: RegulariserStrength, last: bool) -> None:
         """Append an entry about the iteration `it` to the log, if its number is a multiple of 5 or it is the `last`.
 
-        The entry contains the unweighted terms of the loss. `learning_rate`: the rate of Adam for the networks.
+        The entry contains the loss, its unweighted terms and their weights. `learning_rate`: the rate of Adam for the
+        networks. `regulariser`: has the share of self-intersecting triangles, which is logged, too.
         """
         if it.number % LOG_EVERY and not last:
             return

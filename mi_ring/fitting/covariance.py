@@ -28,7 +28,7 @@ BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
 
 
 class Layout:
-    """The places of all unknowns of a calibration in one parameter vector with `count` entries."""
+    """The places of all unknowns of a calibration in one vector of all parameters. Its length is `count`."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.first, self.count = calibration, {}, 0
@@ -37,9 +37,10 @@ class Layout:
             self.count += getattr(calibration, name).numel()
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
-        """List the components of the unknowns that affect the photographs `index` (n,): (name, component, places).
+        """List the components of all unknowns that affect the photographs `index` (n,): (unknown, component, places).
 
-        `places` (n,): the index of this component in the parameter vector, for each photograph.
+        An unknown is given by its name, a component by its number. `places` (n,): for each photograph, the index of
+        this component in the vector of all parameters.
         """
         result = []
         for name, unknown in self.calibration.unknowns.items():
@@ -51,10 +52,10 @@ class Layout:
 
 @torch.no_grad()
 def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
-    """Compute the standard deviation of each refined unknown, except the room's light.
+    """Compute the standard deviation of each refined unknown of calibration, except the room's light.
 
-    Returns arrays by the name of the unknown, each with the shape and the unit of the unknown; {} if there are none.
-    Renders all fitted photographs. `level`: level of the rendered mesh.
+    Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown; {} if there are none. All
+    fitted photographs are rendered. `level`: level of the rendered mesh.
     """
     calibration = model.calibration
     assert calibration is not None
@@ -78,9 +79,9 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
 
 class Equations:
-    """The normal equations of least squares and the variance of the residuals. Photographs are added one by one.
+    """The normal equations of least squares for N = `count` parameters, and the variance of the residuals.
 
-    `count`: number N of parameters.
+    Photographs are added one by one.
     """
 
     def __init__(self, count: int) -> None:
@@ -89,8 +90,9 @@ class Equations:
     def add(self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray) -> None:
         """Add one photograph to the equations.
 
-        `slopes` (K, H, W, C): derivatives of the prediction with respect to the entries `places` (K,) of the parameter
-        vector. `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: pixels to use.
+        `slopes` (K, H, W, C): derivatives of the prediction with respect to K parameters. `places` (K,): their indices
+        among all N parameters. `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: True for pixels
+        to use.
         """
         slopes = slopes[:, counted].flatten(1).double()
         np.add.at(self.matrix, np.ix_(places, places), (slopes @ slopes.T).numpy())
@@ -102,15 +104,18 @@ class Equations:
         self.pixels += channels * int(counted.sum())
 
     def information(self) -> np.ndarray:
-        """Compute the Fisher information matrix (N, N) of all added photographs: the inverse of the covariance."""
+        """Compute the Fisher information matrix (N, N) of all added photographs.
+
+        It is the inverse of their covariance.
+        """
         return self.matrix * (self.pixels / self.squares if self.squares else 0.0)
 
 
 @dataclass(frozen=True)
 class CovarianceGroup:
-    """Photographs of one size that are rendered from the current model, `scale` times smaller.
+    """Photographs of one size, to be rendered from the current model at 1 / `scale` of their width and height.
 
-    `index` (n,): the photographs.
+    `index` (n,): indices of the photographs.
     """
 
     problem: Problem
@@ -121,9 +126,10 @@ class CovarianceGroup:
     scale: int
 
     def photographs(self) -> Photographs:
-        """Return the photographs for the renderer, with the current calibration. Nothing is rendered.
+        """Return the cameras and lights of the group for the renderer, with the current calibration.
 
-        They contain the room's light only if they have no lights of their own.
+        Nothing is rendered. They contain the room's light only if the photographs have no lights of their own. Lamps in
+        the scene get their current values.
         """
         calibration, photographs = self.calibration, self.problem.capture.selected(self.index, self.scale)
         calibration.relight(self.surface)
@@ -131,15 +137,18 @@ class CovarianceGroup:
         return prediction.with_views(replace(photographs, room=room), calibration(self.scale).to(self.problem.device))
 
     def direct(self) -> tuple[Tensor, Tensor]:
-        """Render direct light. Returns linear radiance (n, H, W, 3) and coverage (n, H, W)."""
+        """Render direct light.
+
+        Returns linear radiance (n, H, W, 3) and coverage (n, H, W), the object's share of each pixel.
+        """
         shadows = self.problem.config.shadows and self.problem.capture.shadows
         return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
-        """Render the light that is added to direct light.
+        """Render interreflection and room light. Returns both as linear radiance (n, H, W, 3).
 
-        Returns (interreflection, room light), each linear radiance (n, H, W, 3). Light that the fit does not use is 0.
-        `lit`, `coverage`: results of `direct`.
+        Light that the fit does not use is 0. `lit` (n, H, W, 3): direct light. `coverage` (n, H, W): the object's share
+        of each pixel.
         """
         calibration, indirect = self.calibration, self.indirect
         bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
@@ -155,9 +164,10 @@ class CovarianceGroup:
 
 
 def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes: Equations) -> None:
-    """Compare the photographs of the group `at` with their predictions, and add them to the normal equations.
+    """Compare the photographs of the group `at` with their predictions, and add the result to normal equations.
 
-    Colours are added to `colours`, coverages to `silhouettes`. Both are changed in place.
+    Errors of colours are added to `colours`, errors of silhouettes to `silhouettes`. Both are changed in place.
+    `layout`: the places of all unknowns in the vector of parameters.
     """
     problem, calibration, index = at.problem, at.calibration, at.index
     seen = problem.capture.observe(index, at.scale)

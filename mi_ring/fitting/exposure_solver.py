@@ -32,7 +32,7 @@ class ExposureSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def look(self, it: Iteration) -> None:
-        """Measure how much brighter each photograph is than its prediction, and store it for `step`.
+        """Measure how much brighter each photograph of an iteration is than its prediction, and store it for `step`.
 
         The measure is the median of log(observed / predicted) over bright pixels of the object, for each colour. The
         mean over the photographs is subtracted, because the albedo explains it.
@@ -60,7 +60,7 @@ class ExposureSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Change the estimates for the photographs of the last `look`. Does nothing before refinement begins."""
+        """Change the estimates for the photographs of the last `look`. Does nothing before progress 0.2 of the fit."""
         (group,) = self.param_groups
         for k, brighter in self.seen:
             change = group["lr"] * (brighter / self.width - PULL * self.tensor[k])

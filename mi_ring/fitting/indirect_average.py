@@ -19,11 +19,11 @@ Averages: TypeAlias = dict[int, tuple[int, Tensor]]
 
 
 def averaged(earlier: Averages, new: GlobalIllumination, batch: Batch) -> tuple[GlobalIllumination, Averages]:
-    """Average the interreflection in the photographs of a batch over this iteration and earlier ones.
+    """Average the interreflection in each photograph of a batch over this iteration and earlier ones.
 
-    `earlier`: averages of earlier iterations. `new`: light of this iteration. Returns (`new` with averaged
-    interreflection, new averages of the photographs in the batch). A picture with NaN or infinite pixels does not enter
-    the averages.
+    `earlier`: a dict from the index of a photograph to (number of averaged pictures, average). `new`: light of this
+    iteration. Returns (a copy of `new` with averaged interreflection, new averages of these photographs as a dict of
+    the same kind). A picture with NaN or infinite pixels is not averaged.
     """
     shown, averages = [], {}
     pictures = batch.share.gathered(torch.cat([new.radiance, new.alpha[..., None]], -1))

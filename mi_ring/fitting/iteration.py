@@ -18,7 +18,7 @@ from mi_ring.fitting.schedule import Schedule, Stage
 
 @dataclass(frozen=True)
 class Context:
-    """The parts of a fit that terms of the loss and solvers may read. Batch and prediction are in `Iteration`."""
+    """The state of a fit that terms of the loss and solvers may read beside an iteration's batch and prediction."""
 
     config: Config
     capture: Capture
@@ -54,7 +54,10 @@ class Iteration(renamed.Renamed):
 
     @property
     def progress(self) -> float:
-        """Progress of the fit before this iteration, 0 to 1; 1 when the surface is fixed."""
+        """Progress of the fit before this iteration, from 0 to 1.
+
+        It stays 1 in the last stage, when the surface is fixed.
+        """
         return self.batch.progress
 
     @property
@@ -63,14 +66,14 @@ class Iteration(renamed.Renamed):
         return self.batch.stage
 
     def object_pixels(self) -> Tensor:
-        """Find the pixels that show only the object. Returns (n, H, W) bool.
+        """Return a boolean mask (n, H, W): True where a pixel shows only the object.
 
-        The predicted coverage decides, together with the mask if there is one.
+        The predicted coverage of the pixel must be above 0.99 and, if the photograph has a mask, the mask, too.
         """
         return self.observation.surely(self.prediction.coverage.detach())
 
     def counted(self) -> Tensor | None:
-        """Return the pixels (n, H, W) bool that the colour loss compares; None stands for all pixels.
+        """Return a boolean mask (n, H, W) of the pixels that the colour loss compares; None: all pixels.
 
         In a lit room only the object's pixels are compared, because the background is bright.
         """
@@ -82,9 +85,10 @@ class Iteration(renamed.Renamed):
 
     @torch.no_grad()
     def unexplained(self) -> float:
-        """Return the sum of absolute errors on the object, divided by the sum of observed radiance on the object.
+        """Return the share of the observed light that the prediction does not explain.
 
-        It is NaN if the observed radiance is 0.
+        It is the sum of absolute errors, divided by the sum of observed radiance, over pixels that show only the
+        object. It is NaN if the observed radiance is 0.
         """
         pixels = self.object_pixels()
         error = (self.prediction.rgb - self.observation.rgb)[pixels]

@@ -81,7 +81,7 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
 
 
 class CoarseFits:
-    """Runs coarse fits of a capture under several lightings and compares their errors. No fit runs twice."""
+    """Runs coarse fits of a capture under several lightings, and compares their errors. No fit runs twice."""
 
     def __init__(self, capture: Capture, config: Config) -> None:
         """Prepare coarse fits of a capture. No fit runs yet. `config`: settings of the fit that will use the light."""
@@ -94,9 +94,9 @@ class CoarseFits:
         self.environment: tuple[np.ndarray, np.ndarray] | None = None
 
     def error(self, lighting: Lighting) -> float:
-        """Return the mean error of the coarse fit under `lighting`; infinite if the fit fails.
+        """Return the mean error of the coarse fit under `lighting`; infinity if this fit fails.
 
-        Runs the fit if necessary.
+        The fit runs now, if it has not run before.
         """
         if lighting in self.errors:
             return self.errors[lighting]
@@ -124,13 +124,16 @@ class CoarseFits:
         return self.errors[lighting]
 
     def best(self, *lightings: Lighting) -> Lighting:
-        """Return the lighting whose coarse fit has the smallest error."""
+        """Return the lighting whose coarse fit has the smallest error.
+
+        Runs the coarse fits that have not run before.
+        """
         return min(lightings, key=self.error)
 
     def lamps(self) -> Lighting:
-        """Find the smallest number of lamps that explains the photographs well enough. Runs coarse fits.
+        """Find the smallest number of lamps, up to 3, that explains the photographs about as well as any.
 
-        The lamps are either as far from the object as the cameras, or infinitely far.
+        Runs coarse fits. The lamps start as far from the object as the cameras, or they are infinitely far.
         """
         several = [self.brightest(count) for count in range(1, MOST + 1)]
         enough = FEWER * min(self.error(some) for some in several if self.are_apart(some))
@@ -139,9 +142,10 @@ class CoarseFits:
         return self.best(lamps, distant) if self.are_apart(distant) else lamps
 
     def are_apart(self, lamps: Lighting) -> bool:
-        """Test whether the estimated lamps are in different directions from the object.
+        """Test whether the lamps that a coarse fit has found are at least 30° apart, seen from the object.
 
-        If not, two of them model one lamp.
+        `lamps`: the lighting of this fit, which runs now if it has not run before. Two lamps in one direction model one
+        lamp.
         """
         self.error(lamps)
         if len(lamps.lamps) < 2:
@@ -155,8 +159,8 @@ class CoarseFits:
     def brightest(self, count: int, distant: bool = False) -> Lighting:
         """Make a lighting of `count` lamps in the brightest directions of the environment that a coarse fit has found.
 
-        Their strength is chosen so that the object's albedo is about 0.5. `distant`: the lamps are infinitely far;
-        otherwise they are as far from the object as the cameras.
+        The lamps are so strong that the object's albedo is about 0.5. `distant`: True for lamps that are infinitely
+        far, False for lamps as far from the object as the cameras. Raises InputError if the coarse fit has failed.
         """
         self.error(Lighting("environment"))
         if self.environment is None:
@@ -169,10 +173,11 @@ class CoarseFits:
         return Lighting("lamps", lamps, distant)
 
     def with_material(self, lighting: Lighting) -> Lighting:
-        """Decide whether a fit under this lighting should begin with one material for the whole object.
+        """Decide whether a fit under `lighting` should begin with one material for the whole object.
 
-        Runs a coarse fit with one material. If it explains the photographs about as well, the fit should. Returns the
-        lighting with this decision and with the lamps that the coarse fit has found.
+        It should if a coarse fit with one material explains the photographs about as well as one with a varying
+        material. Returns a copy of `lighting` with this decision and with the lamps that the coarse fit has found. Runs
+        coarse fits.
         """
         one = lighting._replace(one_material_until=1.0)
         if self.error(one) >= ONE_MATERIAL * self.error(lighting) or not self.are_apart(one):
@@ -181,9 +186,10 @@ class CoarseFits:
 
 
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
-    """List the options of `Config.refine` for a coarse fit under `lighting`. `config`: settings of the real fit.
+    """List the options of `--refine` for a coarse fit under `lighting`. `config`: settings of the real fit.
 
-    A coarse fit refines the camera response. If the lights are those of the scene, it also refines these lights.
+    From the options of the real fit, these are kept: the camera response, and the lights if they are those of the
+    scene.
     """
     own = {*OWN_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
     return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDING, *own}) or ("none",)
@@ -192,11 +198,10 @@ def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
 def brightest(harmonics: np.ndarray, certainty: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Approximate an environment by `count` distant lamps. Returns (unit directions (count, 3), colours (count, 3)).
 
-    `harmonics` (PER_FRAME, 3): spherical harmonics of the environment. `certainty` (PER_FRAME,): information about each
-    harmonic. Colours are relative to the first lamp; the first lamp is white, because the object's colour is unknown.
-
-    The method is weighted least squares with lamps and constant light. It moves one direction after the other to its
-    optimum, until none moves.
+    `harmonics` (PER_FRAME, 3): spherical harmonics of the environment. `certainty` (PER_FRAME,): weight of each
+    harmonic. Colours are relative to the strongest lamp, which is the first; it is white, because the object's colour
+    is unknown. The method is weighted least squares with lamps and constant light. It moves one direction after the
+    other to its optimum, until none moves.
     """
     shown = np.sqrt(np.maximum(certainty, 0))[:, None]
     seen = shown * harmonics

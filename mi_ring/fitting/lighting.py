@@ -26,7 +26,10 @@ Lamp: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]  #: `vector` and `
 
 
 class Lighting(NamedTuple):
-    """The kind of light in a fit, the initial lamps, and assumptions; `mi_ring.choose_lighting` returns one."""
+    """The light that a fit assumes: its kind, the initial lamps, and whether the object has one material at first.
+
+    `mi_ring.choose_lighting` makes one.
+    """
 
     kind: Kind  #: as `Config.light`, except "auto"
     lamps: tuple[Lamp, ...] = ()
@@ -35,10 +38,10 @@ class Lighting(NamedTuple):
 
     @classmethod
     def of(cls, capture: Capture, config: Config) -> "Lighting":
-        """Return the lighting for a fit with the lights of the scene file.
+        """Return the lighting of a fit that uses the lights of the scene.
 
-        Raises InputError if the scene has no lights. Also raises InputError if `config.light` is not "capture": then
-        `choose_lighting` must find the lights.
+        Raises InputError if nothing lights the scene, or if `config.light` is not "capture": `mi_ring.choose_lighting`
+        must then find the light.
         """
         require_compatible(capture, config)
         if config.light != "capture":
@@ -55,9 +58,9 @@ class Lighting(NamedTuple):
     def material_at(self, progress: float, material: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the BSDF parameters (V, …) to render at this `progress` of the fit, 0 to 1.
 
-        `material`: parameters of the V vertices by name. Before `one_material_until`, each vertex gets the mean of all
-        vertices, later its own parameters. Photographs hardly distinguish slow changes of the albedo along the surface
-        from slow changes of the light. At first, the light is to explain both.
+        `material`: a dict from names of parameters to their values at V vertices. Before progress `one_material_until`,
+        each vertex gets the mean of all vertices, because photographs hardly distinguish slow changes of the albedo
+        along the surface from slow changes of the light. Later, the values are returned unchanged.
         """
         if progress >= self.one_material_until:
             return material
@@ -65,7 +68,7 @@ class Lighting(NamedTuple):
 
 
 def require_compatible(capture: Capture, config: Config) -> None:
-    """Raise InputError if `config.light` contradicts the capture or another setting."""
+    """Raise InputError if the setting `light` contradicts the capture or another setting."""
     others, own = shared_emitters(capture.scene), OWN_LIGHTS & set(config.refine)
     if config.light == "capture":
         if own and capture.photographs.dark:
@@ -94,15 +97,15 @@ def require_compatible(capture: Capture, config: Config) -> None:
 
 
 def is_unlit(capture: Capture) -> bool:
-    """Test whether the capture has neither lights of photographs nor room light."""
+    """Test whether a capture has no light at all: neither lights of photographs nor room light."""
     return capture.photographs.dark and capture.room is None
 
 
 def exposures(capture: Capture) -> np.ndarray:
-    """Compute the relative exposures (P, 3) of the photographs, if all photographs have the same light.
+    """Compute the relative exposures (P, 3) of the photographs, under the assumption that one light lit them all.
 
-    They are the strengths of the photographs' own lights, divided by the mean strength. All are 1 if a light is black,
-    or if some lights are point lights and others distant.
+    They are the strengths of the photographs' own lights, divided by their mean. All are 1 if a light is black, or if
+    some lights are point lights and others distant.
     """
     strengths = capture.photographs.lights.rgb()
     kinds = capture.photographs.lights.is_finite()
@@ -112,10 +115,10 @@ def exposures(capture: Capture) -> np.ndarray:
 
 
 def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -> Lighting:
-    """Return `lighting` with the lamps that a fit has found. A lighting without lamps is returned unchanged.
+    """Return a copy of `lighting` with the lamps that a fit has found. Without lamps, `lighting` itself is returned.
 
     `capture`: the calibrated capture of this fit. `center` (3,): centre of the object. All strengths are multiplied by
-    one factor, so that the first lamp lights the object as strongly as before and the assumed albedo stays valid.
+    one factor, so that the first lamp lights the object as strongly as in `lighting`.
     """
     if not lighting.lamps:
         return lighting
@@ -128,10 +131,10 @@ def with_found_lamps(lighting: Lighting, capture: Capture, center: np.ndarray) -
 
 
 def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
-    """Return the capture with the lights of `lighting`. With the kind "capture", it is returned unchanged.
+    """Return a copy of the capture with the lights of `lighting`.
 
-    The first lamp becomes the light of each photograph, the others become lamps of the scene. An unknown environment is
-    grey at the start.
+    If its kind is "capture", the same capture is returned. The first lamp becomes the light of each photograph, the
+    others become lamps of the scene. An unknown environment is grey at the start.
     """
     if lighting.kind == "capture":
         return capture
@@ -152,11 +155,11 @@ def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
 
 
 def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:
-    """Convert the environment map of the scene to spherical harmonics: they are rendered without noise.
+    """Replace the environment map of a capture's scene by spherical harmonics, which are rendered without noise.
 
     Returns (capture whose `room` contains the harmonics, scene without the environment map, harmonics (BASIS, 3)).
-    Returns (the same capture, its scene, None) in three cases: the scene has no environment map; a photograph has no
-    mask, so that its background shows the environment map; the BSDF is not `cooktorrance`.
+    Nothing is replaced, and the last is None, if there is no environment map, if a photograph has no mask (its
+    background shows the map), or if the BSDF is not `cooktorrance`.
     """
     if not all(capture.masks.given) or not hasattr(capture.shape.bsdf(), "lobes"):
         return capture, capture.scene, None
@@ -168,6 +171,6 @@ def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray
 
 
 def room_frames(capture: Capture, lighting: Lighting) -> Collection[str]:
-    """Return the coordinate frames in which unknown room light does not change: "world", "camera" or both."""
+    """Return the axes in which the unknown light of the room is fixed: a collection of "world" and "camera"."""
     own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

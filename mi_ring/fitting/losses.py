@@ -12,9 +12,10 @@ STEP = 0.02  #: of the Laplacian; small against the period of the encoding's hig
 
 
 def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
-    """Convert radiance of any shape to the scale on which the colour loss `kind` compares it; see `rgb_loss`.
+    """Convert radiance of any shape to the scale on which the colour loss compares it. First divides by `exposure`.
 
-    `exposure`: mean radiance of the object. The radiance is first divided by it.
+    `exposure`: mean radiance of the object. `kind`: "l1" and "l2" keep the quotient x, "log" takes log(1 + 4 x),
+    "l1+log" takes the mean of both.
     """
     linear = photographs / exposure
     if kind in ("l2", "l1"):
@@ -26,10 +27,11 @@ def perceived(photographs: Tensor, exposure: float, kind: str) -> Tensor:
 def colour_error(
     predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, counted: Tensor | None = None
 ) -> Tensor:
-    """Compute the difference (n, H, W, 3) of predicted and observed photographs on the scale of `perceived`.
+    """Compute the difference (n, H, W, 3) of predicted and observed photographs on the scale of the colour loss `kind`.
 
-    `clipped` (n, H, W, 3) bool: the photograph is saturated; a brighter prediction is no error there. `counted` (n, H,
-    W) bool: pixels to compare; in all others the error is 0. None: all pixels are compared.
+    `kind`: "l1", "l2", "log" or "l1+log". `exposure`: mean radiance of the object. `clipped` (n, H, W, 3) bool: True
+    where the photograph is saturated; a brighter prediction is no error there. `counted` (n, H, W) bool: pixels to
+    compare; in all others the difference is 0. None: all pixels.
     """
     error = perceived(predicted, exposure, kind) - perceived(observed, exposure, kind)
     error = torch.where(clipped, error.clamp(max=0), error)
@@ -39,10 +41,12 @@ def colour_error(
 def rgb_loss(
     predicted: Tensor, observed: Tensor, clipped: Tensor, exposure: float, kind: str, counted: Tensor | None = None
 ) -> Tensor:
-    """Compute L_rgb, the mean difference of predicted and observed photographs. Arguments: as for `colour_error`.
+    """Compute L_rgb, the mean difference of predicted and observed photographs (n, H, W, 3). Returns a scalar.
 
-    `kind`: "l2" squares the differences, as in the paper. "l1" takes absolute differences, which are less sensitive to
-    outliers. "log" compares ratios, so that dark surfaces count as much as bright ones. "l1+log" is the mean of both.
+    `clipped` (n, H, W, 3) bool: saturated values; a brighter prediction is no error there. `exposure`: mean radiance of
+    the object. `counted` (n, H, W) bool: pixels to compare; None: all. `kind`: "l2" squares the differences, as in the
+    paper. "l1" takes absolute differences, which are less sensitive to outliers. "log" compares logarithms, so that
+    dark surfaces count as much as bright ones. "l1+log" is the mean of both.
     """
     error = colour_error(predicted, observed, clipped, exposure, kind, counted)
     return error.square().mean() if kind == "l2" else error.abs().mean()
@@ -51,7 +55,7 @@ def rgb_loss(
 def mask_loss(
     coverage: Tensor, mask: Tensor, sigma: float, valid: Tensor | None = None, doubt: float = math.inf
 ) -> Tensor:
-    """Compute the mean squared difference of coverage (n, H, W) and mask (n, H, W), after a blur.
+    """Compute the mean squared difference of coverage (n, H, W) and mask (n, H, W), both in [0, 1], after a blur.
 
     `sigma`: standard deviation of the Gaussian blur [px]. Because of the blur, an outline that does not touch the mask
     has a gradient. `valid` (n, H, W): pixels that are compared; None: all. `doubt`: differences above it have a limited
@@ -66,7 +70,7 @@ def mask_loss(
 def velocity_loss(velocity: Callable[[Tensor], Tensor], x: Tensor, laplacian_scale: float) -> Tensor:
     """Compute L_reg = mean ‖(I − αΔ) V(x)‖² at points x (n, 3) of the flow. V: `velocity`. α: `laplacian_scale`.
 
-    The Laplacian Δ is computed from differences to six points at the distance `STEP`.
+    The Laplacian Δ is computed from finite differences to six neighbours of each point.
     """
     offsets = STEP * torch.cat([torch.eye(3), -torch.eye(3)]).to(x)
     v = velocity(torch.cat([x[None], x + offsets[:, None]]))

@@ -28,10 +28,11 @@ Masks: TypeAlias = dict[int, Tensor]  #: (h, w) uint8, 0 or 1, perhaps of reduce
 
 
 def find_masks(capture: Capture, exposure: float, model: Model, renderer: Renderer, level: int) -> Masks:
-    """Segment the object in all photographs, near the outline of the current surface. Returns masks by photograph.
+    """Segment the object in all photographs, near the outline of the current surface. Renders the surface.
 
-    A photograph whose new mask is implausible gets none. Photographs from one viewpoint share a mask. `exposure`: mean
-    radiance of the object. `level`: level of the mesh that is rendered.
+    Returns a dict from the index of a photograph to its new mask (h, w) uint8, 0 or 1. The mask may be smaller than the
+    photograph. A photograph whose new mask is implausible is left out. Photographs from one viewpoint share a mask.
+    `exposure`: mean radiance of the object. `level`: level of the mesh that is rendered.
     """
     capture = model.calibrated(capture)
     surface = renderer.show(model, level)
@@ -68,7 +69,10 @@ def find_masks(capture: Capture, exposure: float, model: Model, renderer: Render
 
 
 def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
-    """Return a capture in which `masks`, from `find_masks`, replace the masks of their photographs."""
+    """Return a copy of the capture with new masks. `masks`: a dict from the index of a photograph to its new mask.
+
+    A mask is (h, w) uint8, 0 or 1. It is enlarged to the size of the photograph. Other photographs keep their masks.
+    """
 
     def enlarged(mask: Tensor, size: tuple[int, int]) -> np.ndarray:
         (width, height), (rows, columns) = size, mask.shape

@@ -1,4 +1,4 @@
-"""The optimiser Muon for weight matrices. Its steps are orthogonalised momentum."""
+"""The optimiser Muon for weight matrices. Its steps are gradients with momentum, made orthogonal as matrices."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -15,9 +15,10 @@ MOMENTUM = 0.95
 
 
 class Muon(torch.optim.Optimizer):
-    """The optimiser `torch.optim.Muon` without weight decay. `dtype`: number format of the orthogonalisation.
+    """The same optimiser as `torch.optim.Muon`, without weight decay and with a choice of the number format.
 
-    PyTorch's version always uses bfloat16. Most processors emulate this format and need 20 times as long for it.
+    `dtype`: number format in which steps are made orthogonal. PyTorch always uses bfloat16. Most processors emulate it
+    and need 20 times as long.
     """
 
     def __init__(self, params: Iterable[Tensor], lr: float, dtype: torch.dtype) -> None:
@@ -26,7 +27,10 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Update all weight matrices once. The step of a tall matrix is √(height / width) times as long."""
+        """Update all weight matrices that have gradients once.
+
+        The step of a matrix that has more rows than columns is longer by the factor √(rows / columns).
+        """
         for group in self.param_groups:
             params = [p for p in group["params"] if p.grad is not None]
             updates = []
@@ -46,7 +50,10 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonalised(matrix: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return an approximately orthogonal matrix: like `matrix`, but with singular values between 0.7 and 1.2."""
+    """Return an approximately orthogonal matrix near `matrix`: its singular values become numbers between 0.7 and 1.2.
+
+    `dtype`: number format of the computation and the result.
+    """
     a, b, c = COEFFICIENTS
     x = matrix.to(dtype)
     tall = x.shape[0] > x.shape[1]

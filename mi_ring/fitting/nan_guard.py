@@ -14,7 +14,7 @@ RETREATS = 5  #: number of retreats after which a fit fails
 
 
 class NanGuard:
-    """Detects NaN in a model and its optimisers, and restores a copy of an earlier, finite state."""
+    """Detects NaN and infinity in a model and its optimisers, and restores a copy of an earlier, finite state."""
 
     def __init__(
         self, model: nn.Module, optimizers: Sequence[torch.optim.Optimizer], state: dict[str, Any] | None = None
@@ -38,8 +38,8 @@ class NanGuard:
     def note(self, healthy: bool) -> bool:
         """Record an iteration. After repeated failures, or if the model is not finite, restore the last copy.
 
-        Makes a new copy from time to time. `healthy`: loss and gradients were finite, and the optimisers have made
-        their steps. Returns False if it has restored a copy too often; then the fit has diverged.
+        From time to time, a new copy is made. `healthy`: True if loss and gradients were finite and the optimisers have
+        made their steps. Returns False if copies were restored too often: the fit has diverged. Returns True otherwise.
         """
         self.failures = 0 if healthy else self.failures + 1
         if self.failures < PATIENCE and self.finite():

@@ -32,7 +32,7 @@ NEAR, FAR = 0.2, 0.4  #: progress at which steps begin, for a start near the obj
 def slopes(picture: Tensor) -> Tensor:
     """Compute the image gradient of a picture (H, W, C) by central differences.
 
-    Returns (H, W, C, 2): derivatives to the right and downward.
+    Returns (H, W, C, 2): derivatives to the right and downward, per pixel.
     """
     padded = F.pad(picture.movedim(-1, 0), (1, 1, 1, 1), mode="replicate")
     right = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]
@@ -41,13 +41,13 @@ def slopes(picture: Tensor) -> Tensor:
 
 
 def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: float) -> Tensor:
-    """Compute how points of a sphere move in the picture if the camera moves: a Jacobian (H, W, 2, 6) per pixel.
+    """Compute how points of a sphere move in the picture if the camera moves. Returns a Jacobian (H, W, 2, 6).
 
     The two rows are the motion to the right and downward [px]. The six columns are the rotation [rad] about each of the
-    camera's axes and the translation [scene units] along each of them (Mitsuba's axes). `intrinsics` (4,): fx, fy, cx,
-    cy [px], without distortion. `size`: (width, height) of the picture [px]. `center` (3,), `radius`: the sphere, in
-    camera coordinates; it is made smaller if the camera is inside. The point of a ray that misses the sphere is the
-    point of the ray that is nearest to the sphere.
+    camera's axes and the translation [scene units] along each of them (x left, y up, z forward). `intrinsics` (4,): fx,
+    fy, cx, cy [px], without distortion. `size`: (width, height) of the picture [px]. `center` (3,), `radius`: the
+    sphere, in camera coordinates; it is made smaller if the camera is inside. If the ray of a pixel misses the sphere,
+    the point of the ray nearest to the sphere is used.
     """
     width, height = size
     fx, fy, cx, cy = intrinsics
@@ -90,14 +90,17 @@ class PoseSolver(torch.optim.Optimizer):
         self.seen: tuple[Tensor, Tensor] | None = None  #: photographs and their curvature
 
     def look(self, it: Iteration) -> None:
-        """Store the photographs of an iteration and the Gauss-Newton Hessian of its loss, for `step`."""
+        """Store the indices of an iteration's photographs and the Gauss-Newton Hessians of its loss, for `step`."""
         self.seen = None
         if it.progress >= self.rate.start:
             self.seen = torch.from_numpy(it.batch.all_photographs), it.batch.share.gathered(curvature(it))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Change the poses of the stored photographs by a Gauss-Newton step. Does nothing before refinement begins."""
+        """Change the poses of the photographs that `look` has stored, by a Gauss-Newton step.
+
+        Does nothing before refinement begins.
+        """
         (group,) = self.param_groups
         turn, move = group["params"]
         if self.seen is None or turn.grad is None:
@@ -114,11 +117,11 @@ class PoseSolver(torch.optim.Optimizer):
 
 @torch.no_grad()
 def curvature(it: Iteration) -> Tensor:
-    """Compute the Gauss-Newton Hessian (n, 6, 6) of an iteration's loss with respect to each photograph's pose.
+    """Compute the Gauss-Newton Hessian (n, 6, 6) of an iteration's loss with respect to the pose of each photograph.
 
-    The pose is (`turn`, `move`) [standard deviations of the priors]. The Hessian contains colours, silhouettes and
-    prior. It approximates the surface by a sphere. Absolute differences are treated by iteratively reweighted least
-    squares; those below the mean get the weight of the mean.
+    The pose is three rotations and three translations [standard deviations of their priors]. The Hessian contains
+    colours, silhouettes and prior. It approximates the surface by a sphere. Absolute differences are treated by
+    iteratively reweighted least squares; those below the mean get the weight of the mean.
     """
     context, seen, prediction = it.context, it.observation, it.prediction
     calibration, (n, height, width) = context.model.calibration, prediction.coverage.shape

@@ -21,9 +21,9 @@ EPS = 1e-3  #: least mean to divide by, and least distance of a share from 0 and
 def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
     """Compute the total variation of the normals of a closed mesh: vertices (V, 3), faces (F, 3). It is a length.
 
-    It is a sum over all edges: the length of the edge times the distance between the normals of the two triangles at it
-    ("Discrete total variation of the normal vector field as shape prior", Bergmann et al., Inverse Problems 2020;
-    chords instead of angles). A sharp bend costs about as much as a round one, and ripples cost more. A sphere of
+    It is a sum over all edges: the length of the edge times the distance between the normals of the two adjacent
+    triangles ("Discrete total variation of the normal vector field as shape prior", Bergmann et al., Inverse Problems
+    2020; chords instead of angles). A sharp bend costs about as much as a round one, and ripples cost more. A sphere of
     radius R and even triangles has 8πR.
     """
     pairs, ends = trimesh.graph.face_adjacency(faces, return_edges=True)
@@ -34,10 +34,10 @@ def variation_of_normals(vertices: Tensor, faces: np.ndarray) -> Tensor:
 
 
 def variation_of_values(vertices: Tensor, faces: np.ndarray, values: Tensor) -> Tensor:
-    """Compute the total variation of values (V, C) on a mesh, divided by the area of the mesh. Sums over channels.
+    """Compute the mean length of the gradient of `values` (V, C) along a mesh, summed over channels. Unit: 1 / length.
 
-    This is the mean length of the surface gradient, per unit of length. The mesh: `vertices` (V, 3), `faces` (F, 3).
-    The values are linear on each triangle.
+    The mesh has `vertices` (V, 3) and `faces` (F, 3). The values are linear on each triangle. The mean is over the
+    area.
     """
     corners = torch.as_tensor(faces, device=vertices.device)
     a, b, c = vertices[corners].unbind(1)
@@ -51,9 +51,9 @@ def variation_of_values(vertices: Tensor, faces: np.ndarray, values: Tensor) -> 
 def number_of_bases(values: Tensor) -> Tensor:
     """Measure the rank of a matrix M = `values` (V, C) smoothly, by nuclear norm over Frobenius norm, ‖M‖₁ / ‖M‖₂.
 
-    The result is 1 if all rows are multiples of one basis material, √k for k orthogonal bases of equal strength, and at
-    most √C. The nuclear norm is the convex relaxation of the rank (Fazel 2002). Because of the division, a darker
-    material does not cost less.
+    The rows are materials. The result is 1 if all rows are multiples of one row, √k for k orthogonal basis materials of
+    equal strength, and at most √C. The nuclear norm is the convex relaxation of the rank (Fazel 2002). Because of the
+    division, a darker material does not cost less.
     """
     return torch.linalg.matrix_norm(values, "nuc") / values.norm()
 
@@ -61,7 +61,9 @@ def number_of_bases(values: Tensor) -> Tensor:
 def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
     """Arrange the material parameters of V points as a matrix (V, C) of numbers near 1.
 
-    A parameter without upper bound is divided by BRDF-Net's `scale`. Another parameter becomes a share of its range.
+    `material`: a dict from names of parameters to values (V, …). A parameter without upper bound is divided by
+    `brdf_net.scale`, the order of magnitude of the reflectances. Any other parameter is mapped from its range to [0,
+    1].
     """
     columns = []
     for p in brdf_net.bsdf_parameters:
@@ -73,18 +75,18 @@ def columns_of(material: dict[str, Tensor], brdf_net: MaterialNet) -> Tensor:
 def normal_variation(it: Iteration) -> Tensor:
     """Compute the term `normal_variation`: the total variation of the normals, divided by that of a sphere.
 
-    The sphere has the radius of the normalising sphere.
+    This sphere is as large as the normalising sphere of the object.
     """
     radius = it.context.model.ring.radius
     return variation_of_normals(it.prediction.vertices, it.batch.faces) / (8 * math.pi * radius)
 
 
 def albedo_variation(it: Iteration) -> Tensor:
-    """Compute the mean length of the surface gradient of the material, times the object's radius, for `settling`.
+    """Compute the mean length of the surface gradient of the material, times the object's radius.
 
-    Reflectances are divided by their mean, because half the reflectance in twice the light looks the same. A parameter
-    with an upper bound, such as a roughness, is replaced by its logit; its share of the range would vary less near the
-    bounds. The shape gets no gradient.
+    The term `settling` uses it. Reflectances are divided by their mean, because half the reflectance in twice the light
+    looks the same. A parameter with an upper bound, such as a roughness, is replaced by its logit; its share of the
+    range would vary less near the bounds. The shape gets no gradient.
     """
     ring, prediction = it.context.model.ring, it.prediction
     values = columns_of(prediction.material, ring.brdf_net)
@@ -94,5 +96,5 @@ def albedo_variation(it: Iteration) -> Tensor:
 
 
 def material_rank(it: Iteration) -> Tensor:
-    """Compute the term `material_rank`: a smooth measure of the number of basis materials; see `number_of_bases`."""
+    """Compute the term `material_rank`: a smooth measure of how many basis materials the material consists of."""
     return number_of_bases(columns_of(it.prediction.material, it.context.model.ring.brdf_net))

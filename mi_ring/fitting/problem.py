@@ -34,9 +34,10 @@ class Problem:
 
     @classmethod
     def of(cls, capture: Capture, config: Config, lighting: Lighting) -> "Problem":
-        """Prepare a fit of `capture`.
+        """Prepare the problem of a fit. Large photographs are reduced, and some photographs are held out.
 
-        Raises InputError if no photograph is left to fit, or if the object is black in all.
+        `lighting`: the light that the fit assumes. Raises InputError if no photograph is left to fit, or if the object
+        is black in all photographs.
         """
         given, capture = capture, reduced(capture, max(WIDTH, *config.widths))
         held_out = held_out_photographs(capture, config.holdout)

@@ -49,7 +49,10 @@ class Processes:
         return value
 
     def agreed(self, work: Callable[[], Value]) -> Value:
-        """Call `work` in each process. Returns this process's result. An InputError in one process is raised in all."""
+        """Call `work` in each process. Returns this process's result.
+
+        If `work` raises InputError in one process, all processes raise it.
+        """
         return work()
 
     def on_first(self, work: Callable[[], Value]) -> Value:
@@ -67,11 +70,14 @@ class Processes:
         """Wait until all processes have called this method."""
 
     def share(self, total: int) -> "Share":
-        """Return this process's share of `total` photographs or points."""
+        """Return this process's share of `total` photographs or points, which are divided among all processes."""
         return Share(self, total)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """Replace the gradient of each parameter by its sum over all processes; None if no process has a gradient."""
+        """Replace the gradient of each parameter, in place, by its sum over all processes.
+
+        The gradient stays None if no process has one.
+        """
 
 
 class Team(Processes):
@@ -90,12 +96,12 @@ class Team(Processes):
         atexit.register(self.leave)
 
     def leave(self) -> None:
-        """Leave the process group. The end of the process calls this; a process cannot join a group twice."""
+        """Leave the group of processes, when this process ends. A process cannot join a group twice."""
         with contextlib.suppress(RuntimeError):
             self.distributed.destroy_process_group()
 
     def attempt(self, exchange: Callable[[], None]) -> None:
-        """Call `exchange`, which communicates with other processes. Raises ProcessLost if one of them is gone."""
+        """Call `exchange`, which communicates with other processes. Raises ProcessLost if another process is gone."""
         try:
             exchange()
         except RuntimeError as error:
@@ -103,7 +109,10 @@ class Team(Processes):
                               "checkpoint with the same command and --resume") from error  # fmt: skip
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """Return the sum of a tensor over all processes; see `Processes.sum`."""
+        """Sum a tensor over all processes. Returns the sum in each process, without gradients.
+
+        All tensors have the same shape.
+        """
         place = device() if self.nccl else torch.device("cpu")
         total = tensor.detach().to(place, copy=True).contiguous()
         self.exchanged, self.exchanges = self.exchanged + total.numel() * total.element_size(), self.exchanges + 1
@@ -111,15 +120,16 @@ class Team(Processes):
         return total.to(tensor.device)
 
     def broadcast(self, value: Value) -> Value:
-        """Return the first process's `value` in all processes. It is sent by pickle."""
+        """Return the first process's `value` in all processes. The value must be picklable."""
         box = [pickle.dumps(value) if self.rank == 0 else None]
         self.attempt(lambda: self.distributed.broadcast_object_list(box))
         return value if self.rank == 0 else pickle.loads(box[0])  # type: ignore[arg-type]
 
     def agreed(self, work: Callable[[], Value]) -> Value:
-        """Call `work` in each process. If it fails in one process, all raise InputError; see `Processes.agreed`.
+        """Call `work` in each process. Returns this process's result.
 
-        If it fails in several processes, all raise the message of the first of them.
+        If `work` raises InputError in one process, all processes raise it. If several fail, all raise the first one's
+        error.
         """
         result: Any = None
         error: InputError | None = None
@@ -136,7 +146,10 @@ class Team(Processes):
         return result
 
     def on_first(self, work: Callable[[], Value]) -> Value:
-        """Call `work` in the first process only. Returns its result in all processes; see `Processes.on_first`."""
+        """Call `work` in the first process only. Returns its result in all processes.
+
+        An InputError or SystemExit of `work` is raised in all processes.
+        """
         outcome: Any = None
         try:
             outcome = ("value", work()) if self.rank == 0 else None
@@ -162,7 +175,10 @@ class Team(Processes):
         self.maximum(0)
 
     def sum_gradients(self, parameters: Sequence[Tensor]) -> None:
-        """Replace the gradients by their sums over all processes. All gradients are sent together."""
+        """Replace the gradient of each parameter, in place, by its sum over all processes.
+
+        All gradients are sent together. The gradient stays None if no process has one.
+        """
         place = device()
         has = torch.tensor([float(p.grad is not None) for p in parameters])
         grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
@@ -180,20 +196,26 @@ class Rows(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, own: Tensor, share: "Share") -> Tensor:
-        """Return `share.gathered(own)`: the rows of all processes."""
+        """Return the rows (N, C) of all processes. `own` (n, C): this process's rows.
+
+        `share`: which of the N rows they are.
+        """
         ctx.share = share
         return share.gathered(own)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        """Return the gradient of the summed loss of all processes with respect to this process's rows."""
+        """Return the gradient of the summed loss of all processes with respect to this process's rows (n, C).
+
+        `grad` (N, C): gradient of this process's loss with respect to all rows.
+        """
         return ctx.share.processes.sum(grad)[ctx.share.part], None
 
 
 class Share:
-    """This process's share of an iteration's photographs or points. The slice `part` selects it.
+    """This process's share of N photographs or points. The slice `part` selects it.
 
-    If there are more processes than photographs, some processes have the `weight` 0. They render a photograph of
+    If there are more processes than photographs, some processes have the `weight` 0. They repeat a photograph of
     another process, and their result does not count.
     """
 
@@ -204,9 +226,9 @@ class Share:
         self.part = slice(first, last) if last > first else slice(min(first, total - 1), min(first, total - 1) + 1)
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """Sum a tensor over all processes. Returns the sum without gradients.
+        """Sum a tensor over all processes. Returns the sum in each process, without gradients.
 
-        `tensor`: this process's sum over its own photographs.
+        `tensor`: this process's sum over its own photographs. It does not count if the process has the weight 0.
         """
         return self.processes.sum(tensor if self.weight else torch.zeros_like(tensor))
 
@@ -223,7 +245,10 @@ class Share:
         return self.processes.sum(whole)
 
     def concatenated(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Join each process's tensors (n, …) for its points. Returns tensors (N, …) for all points, with gradients."""
+        """Join the rows of all processes, for several tensors. Returns tensors (N, …) for all points, with gradients.
+
+        `tensors`: each (n, …), for this process's points.
+        """
         if self.processes.count == 1:
             return list(tensors)
         columns = [tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None] for tensor in tensors]
@@ -236,13 +261,13 @@ _current: Processes = ALONE
 
 
 def current() -> Processes:
-    """Return the processes of the current fit: the team inside of `joined`, a single process elsewhere."""
+    """Return the processes that work on the current fit: several inside a block of `joined`, a single one elsewhere."""
     return _current
 
 
 @functools.cache
 def team_of_this_process() -> Team:
-    """Return the team of processes to which this process belongs. The first call connects the processes."""
+    """Return the group of processes to which this process belongs. The first call connects them."""
     return Team()
 
 

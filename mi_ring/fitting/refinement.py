@@ -30,10 +30,10 @@ class Refinement(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, center: np.ndarray) -> "Refinement":
-        """Decide what to refine, from the settings and the capture. `center` (3,): centre of the object.
+        """Decide from the settings and the capture what to refine. `center` (3,): centre of the object [scene units].
 
-        `power` is 1 unless `scale` is refined and the lights of the capture are impossibly weak. Then it is the factor
-        of all lights that gives the object a usual albedo.
+        `power` of the result is 1, unless the lights' strengths are refined and those of the capture are impossibly
+        weak. It is then the factor of all lights that gives the object a usual albedo.
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo = math.pi * reflectance
@@ -47,9 +47,10 @@ class Refinement(NamedTuple):
 
 
 def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
-    """List the options of `--refine` that a fit refines. The capture decides what `auto` stands for.
+    """List the options of `--refine` that a fit refines, in a fixed order. The capture decides what `auto` means.
 
-    `light`: the `Lighting.kind`. `albedo`: albedo of the object, computed from the lights' intensities.
+    `light`: kind of the light, such as "capture" or "lamps". `albedo`: of the object, computed from the lights'
+    strengths.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known

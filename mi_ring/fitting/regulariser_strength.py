@@ -16,7 +16,7 @@ UNEXPLAINED = 0.2  #: share of unexplained light at which the regulariser has fu
 
 
 class RegulariserStrength:
-    """Controls the regulariser's strength by unexplained light and self-intersections in recent iterations."""
+    """Controls the regulariser's strength by the unexplained light and the self-intersections of recent iterations."""
 
     def __init__(self) -> None:
         self.crossing: float = 0.0  #: share of self-intersecting triangles at the last count
@@ -45,7 +45,7 @@ class RegulariserStrength:
             self.unexplained += RECENT * (unexplained - self.unexplained)
 
     def strength(self, decay: float) -> float:
-        """Return the factor of the regulariser's weight: it falls from 1 to `decay` during a fit.
+        """Return a factor of the regulariser's weight. It falls from 1 to `decay` during a fit.
 
         The factor stays 1 while the model leaves much light unexplained, for example with wrong lights: a weak
         regulariser would let the surface fold. The factor may exceed 1 while the surface intersects itself.
@@ -57,5 +57,5 @@ class RegulariserStrength:
         return dict(vars(self))
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state`, a result of `state()`."""
+        """Continue with the values in `state`, which the method `state` has returned."""
         vars(self).update(state)

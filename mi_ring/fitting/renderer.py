@@ -23,7 +23,10 @@ from mi_ring.system.machine import autocast
 
 @dataclass(frozen=True)
 class Prediction:
-    """The prediction for a batch: V vertices and n photographs of H × W pixels. Its tensors have gradients."""
+    """The prediction for the photographs of one iteration: V vertices, n photographs of H × W pixels.
+
+    Tensors have gradients.
+    """
 
     vertices: Tensor  #: (V, 3) [scene units]
     material: dict[str, Tensor]  #: parameters of the BSDF by name, (V, 3) or (V,)
@@ -49,9 +52,9 @@ class Renderer:
         self.averages: Averages = {}  #: of interreflection
 
     def show(self, model: Model, level: int) -> Surface:
-        """Evaluate the model at mesh level `level`, without gradients. Returns the surface, ready to be rendered.
+        """Evaluate the networks at mesh level `level`, without gradients. Returns the surface, ready to be rendered.
 
-        If the fit refines lamps, the scene gets their current values.
+        If the fit refines lamps, the lamps of the scene get their current values.
         """
         self.surface.show(model.ring, *model.ring.domain.sample(level))
         if model.calibration:
@@ -68,9 +71,9 @@ class Renderer:
         return rgb[0].numpy()
 
     def predict(self, problem: Problem, model: Model, batch: Batch) -> Prediction:
-        """Evaluate the networks at the batch's points and render its photographs (paper, section 3).
+        """Evaluate the networks at the points of a batch, and render the photographs of the batch (paper, section 3).
 
-        The same model and batch give the same prediction, until the next `remember`.
+        The same model and batch give the same prediction, until `remember` is called.
         """
         config, calibration = problem.config, model.calibration
         vertices, material = self.deform(problem, model.ring, batch)
@@ -97,10 +100,10 @@ class Renderer:
         return Prediction(vertices, material, rgb, coverage, photographs, other, averages, without_room)
 
     def deform(self, problem: Problem, ring: FittedObject, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Evaluate the networks at the batch's domain points.
+        """Evaluate the networks at the domain points of a batch. Returns (vertices (V, 3), material).
 
-        Returns vertices (V, 3) and material parameters (V, …) by name. If there are several processes, each evaluates a
-        part of the points.
+        The material is a dict from names of BSDF parameters to tensors (V, …). If there are several processes, each
+        evaluates some of the points; each gets all results.
         """
         points = problem.processes.share(len(batch.points))
         with self.autocast():
@@ -113,8 +116,8 @@ class Renderer:
     ) -> tuple[GlobalIllumination | None, Averages]:
         """Render interreflection and room light. Returns (this light, new averages of interreflection).
 
-        Returns (None, {}) if there is neither. If the scene has a table, interreflection is averaged over iterations;
-        see `averaged`. Otherwise the averages are empty.
+        `coverage` (n, H, W): the object's share of each pixel. Returns (None, {}) if there is neither light. If the
+        scene has a table, interreflection is averaged over iterations. Otherwise the averages are {}.
         """
         calibration, indirect, harmonics = model.calibration, model.ring.indirect, photographs.harmonics
         if calibration and calibration.solves_room(batch.progress):
@@ -126,7 +129,7 @@ class Renderer:
         return averaged(self.averages, other, batch) if indirect and self.surface.table is not None else (other, {})
 
     def remember(self, prediction: Prediction) -> None:
-        """Store the averages of interreflection in `prediction`, for the next `predict`."""
+        """Store the averages of interreflection that `prediction` contains. The next call of `predict` uses them."""
         self.averages |= prediction.averages
 
     def state(self) -> Averages:
@@ -134,5 +137,5 @@ class Renderer:
         return self.averages
 
     def restore(self, state: Averages) -> None:
-        """Continue with the averages in `state`, a result of `state()`."""
+        """Continue with the averages in `state`, which the method `state` has returned."""
         self.averages = state

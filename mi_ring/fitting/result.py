@@ -24,10 +24,10 @@ def result_of(
     problem: Problem, model: Model, renderer: Renderer, schedule: Schedule, course: Course, capture: Capture,
     terms: Sequence[str], unexplained: float,
 ) -> FitResult:  # fmt: skip
-    """Collect the results of a fit for the functions that write them. Writes no files.
+    """Collect the results of a fit, from which files are written later. Writes no files, but evaluates the surface.
 
-    `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: running mean of
-    `Iteration.unexplained`.
+    `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: share of the
+    observed light that recent predictions do not explain.
     """
     calibration, ring, refined = model.calibration, model.ring, model.calibrated(capture)
 
@@ -61,9 +61,9 @@ def result_of(
 
 
 def room_of(problem: Problem, refined: Capture) -> np.ndarray | None:
-    """Return the room light (BASIS, 3) that the fit has found: that of `refined` minus the scene's own environment.
+    """Return the room light that the fit has found, as spherical harmonics (BASIS, 3); None if there is no such light.
 
-    `refined`: the calibrated capture. Returns None if there is no such light.
+    `refined`: the calibrated capture. The light of the scene's own environment map is subtracted.
     """
     room = refined.room
     if room is None or problem.environment is None:

@@ -38,9 +38,10 @@ class Batch:
 
 
 class Sampler:
-    """Draws batches. Photographs come in random order, and none comes twice before all of its size have come once.
+    """Draws batches. Photographs come in random order.
 
-    Each of the `PURPOSES` has its own random generator. So the draws for one purpose do not change the others.
+    None comes twice before all photographs of its size have come once. Photographs, rotations and seeds each have a
+    random generator. So the number of draws of one does not change the others.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -54,7 +55,10 @@ class Sampler:
         self.waiting: dict[tuple[int, int], list[int]] = {}
 
     def draw(self, problem: Problem, schedule: Schedule, domain: Domain, iteration: int) -> Batch:
-        """Draw the batch for an `iteration`, counted from 0."""
+        """Draw the batch for an `iteration`, counted from 0.
+
+        `domain`: the start surface, from which points are drawn.
+        """
         stage = schedule.stage(iteration)
         points, faces = domain.sample(stage.level, self.random["rotations"] if problem.config.resample else None)
         everyone, size = self.draw_photographs(problem.config.batch)
@@ -64,7 +68,7 @@ class Sampler:
                      everyone[share.part], everyone, size, -(-size[0] // stage.width), seeds, share)  # fmt: skip
 
     def draw_photographs(self, count: int) -> tuple[np.ndarray, tuple[int, int]]:
-        """Draw `count` photographs of one size, or all of that size if there are fewer.
+        """Draw `count` photographs of one size, or all photographs of this size if there are fewer.
 
         Returns (their indices, their size (width, height) [px]).
         """
@@ -79,7 +83,7 @@ class Sampler:
         return np.array(waiting[:count]), size
 
     def observe(self, problem: Problem, capture: Capture, batch: Batch) -> Observation:
-        """Read this process's photographs of a batch from `capture`.
+        """Read this process's photographs of a batch from `capture`, at the scale of the batch.
 
         Raises InputError in all processes if one process cannot read its files.
         """
@@ -87,11 +91,14 @@ class Sampler:
         return seen.to(problem.device)
 
     def state(self) -> dict[str, Any]:
-        """Return the states of the random generators and the photographs still to come, for a checkpoint."""
+        """Return the states of the random generators, and the photographs still to come, for a checkpoint."""
         return {"random": {name: random.get_state() for name, random in self.random.items()}, "waiting": self.waiting}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state`, a result of `state()`. Raises ValueError if it has photographs that are not fitted."""
+        """Continue from `state`, which the method `state` has returned.
+
+        Raises ValueError if it contains photographs that are not fitted.
+        """
         if not {k for some in state["waiting"].values() for k in some} <= {k for a in self.alike.values() for k in a}:
             raise ValueError("photographs that are not fitted")
         for name, random in self.random.items():

@@ -39,7 +39,8 @@ def ending_signals() -> Iterator[Callable[[], int]]:
     """Context manager that catches the signals that end a fit, so that the fit can end in order.
 
     Yields a function that returns the number of the first signal received, or 0. After the first signal, Ctrl-C ends
-    the program at once. Repetitions of other signals have no effect: shells and schedulers may send them repeatedly.
+    the program at once. Other signals have no effect when they are repeated: shells and schedulers may send them
+    repeatedly.
     """
     received: list[int] = []
 
@@ -57,9 +58,10 @@ def ending_signals() -> Iterator[Callable[[], int]]:
 
 
 class Keeper:
-    """Writes log, checkpoints and results of a fit into its folder. If writing fails, it tries again later.
+    """Writes log, checkpoints and results of a fit into its folder.
 
-    If the fit has several processes, only the first one writes. `prepare`: makes the folder again if it was removed.
+    If writing a checkpoint fails, it tries again later. If the fit has several processes, only the first one writes.
+    `prepare`: a function that makes the folder again, if somebody has removed it.
     """
 
     def __init__(self, fit: Fit, folder: Path, prepare: Callable[[], None]) -> None:
@@ -69,7 +71,7 @@ class Keeper:
         self.saved, self.failing = -math.inf, False
 
     def follow(self, it: Iteration) -> None:
-        """Write log and checkpoint if they are due after the iteration `it`.
+        """Write log and checkpoint if they are due after the iteration `it`. If this fails, the user gets a message.
 
         A checkpoint is due every 30 seconds and at the end of each stage.
         """
@@ -93,7 +95,7 @@ class Keeper:
         write_checkpoint(self.fit, self.files, self.folder)
 
     def attempt(self, write: Callable[[], None]) -> None:
-        """Call `write`. If it fails, tell the user once, and do not raise the error."""
+        """Call `write`. If it fails, print a message, once until it succeeds again. The error is not raised."""
         try:
             write()
         except (InputError, OSError) as error:
@@ -106,7 +108,8 @@ class Keeper:
     def finish(self, fitted_scene: bytes) -> None:
         """Write the results. `fitted_scene`: content of the scene file with the fitted object.
 
-        If the results cannot be written, writes them to a new temporary folder and raises InputError, which names it.
+        If they cannot be written to the results folder, they are written to a new temporary folder, and InputError,
+        which names this folder, is raised.
         """
         if not self.writes:
             return
@@ -120,7 +123,8 @@ class Keeper:
     def rescue(self, result: FitResult, fitted_scene: bytes) -> str:
         """Write as much as possible of checkpoint and results to a new temporary folder.
 
-        Returns a text for the user that names this folder.
+        `fitted_scene`: content of the scene file with the fitted object. Returns a text for the user that names the
+        folder.
         """
         saved = ""
         try:
@@ -141,8 +145,8 @@ class Keeper:
 def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs | None) -> None:
     """Run the iterations of a fit until its end or an interruption, with progress bar, log and checkpoints.
 
-    `interrupted`: returns the number of the signal that interrupts the fit, or 0. `costs`: seconds per iteration, for
-    the progress bar; None: measure them.
+    `interrupted`: returns the number of the signal that interrupts the fit, or 0. `costs`: for the progress bar, a dict
+    from (mesh level, photograph width) to seconds per iteration; None: measure them now.
     """
     if costs is None and fit.iterations - fit.iteration >= WORTH_MEASURING and not interrupted():
         left = [stage for stage in fit.schedule.stages if stage.last > fit.iteration]
@@ -177,7 +181,10 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
 
 @contextlib.contextmanager
 def resume_hint(folder: Path) -> Iterator[None]:
-    """Context manager for the case that a second Ctrl-C ends the program: it prints how to resume the fit."""
+    """Context manager that prints how to resume the fit, if a second Ctrl-C ends the program.
+
+    `folder`: the results folder. Nothing is printed if it has no checkpoint.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -199,8 +206,8 @@ def start_of(fit: Fit) -> str:
 def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Costs | None = None) -> int:
     """Run a fit and write its results into `folder`, even if the fit is interrupted or fails.
 
-    Returns the number of the signal that interrupted the fit, or 0. `prepare`: makes the folder again if it was
-    removed. `costs`: seconds per iteration; None: measure them.
+    Returns the number of the signal that interrupted the fit, or 0. `prepare`: makes the folder again if somebody has
+    removed it. `costs`: a dict from (mesh level, photograph width) to seconds per iteration; None: measure them now.
     """
     processes, model, config = fit.problem.processes, fit.model, fit.problem.config
     fitted_scene = processes.on_first(lambda: results.fitted_scene(fit.problem.given, fit.ring, folder))

@@ -32,7 +32,7 @@ DISPROPORTIONATE = 20.0  #: ratio of size, or distance in radii, of start surfac
 
 
 def require_settings(capture: Capture, config: Config) -> None:
-    """Raise InputError if a setting contradicts the capture, or if one of the two has another type."""
+    """Raise InputError if `capture` or `config` has a wrong type, or if a setting contradicts the capture."""
     for name, value, kind in (("capture", capture, Capture), ("config", config, Config)):
         if not isinstance(value, kind):
             raise InputError(f"{name}: is {type(value).__name__}, must be a mi_ring.{kind.__name__}")
@@ -50,12 +50,15 @@ def require_settings(capture: Capture, config: Config) -> None:
 
 
 class StateError(InputError):
-    """Error for a state that is not the state of such a fit."""
+    """Error for a saved state that does not belong to the fit that is to continue from it."""
 
 
 @contextlib.contextmanager
 def restoring() -> Iterator[None]:
-    """Context manager that turns the errors of a wrong state of a fit into StateError."""
+    """Context manager for reading the saved state of a fit.
+
+    It turns errors that a wrong state causes into StateError.
+    """
     try:
         yield
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -66,15 +69,18 @@ def restoring() -> Iterator[None]:
 
 
 def restored(state: dict[str, Any]) -> tuple[Lighting, FittedObject]:
-    """Read lighting and object from the state of a fit. Raises StateError if it has neither."""
+    """Read (lighting, fitted object) from the saved state of a fit.
+
+    Raises StateError if the state lacks one of them.
+    """
     with restoring():
         return Lighting(*state["lighting"]), ring_of(state["ring"])
 
 
 def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -> FittedObject:
-    """Make the object as it is before the first iteration. `networks`: (Shape-Net, BRDF-Net); None: the paper's.
+    """Make the object as it is before the first iteration. `networks`: (Shape-Net, BRDF-Net); None: those of the paper.
 
-    Raises InputError if capture, settings and networks do not go together.
+    Raises InputError if capture, settings and networks contradict each other.
     """
     capture, config = problem.seen, problem.config
     domain, center, radius = starting_surface(capture, config.domain)
@@ -115,9 +121,10 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
 
 
 def with_fresnel(bsdf: str) -> str:
-    """Switch on the Fresnel term of a `cooktorrance` unless its XML, `bsdf`, says whether it is on. Returns XML.
+    """Switch on the Fresnel term of a BSDF `cooktorrance`, unless its XML says whether it is on.
 
-    The term makes no difference for a flash at the camera. It makes one for light from other sides.
+    `bsdf`: the XML. Returns the changed XML. The term makes no difference for a flash at the camera. It makes one for
+    light from other sides.
     """
     element = ElementTree.fromstring(bsdf)
     if element.find("boolean[@name='fresnel']") is None:
@@ -126,10 +133,10 @@ def with_fresnel(bsdf: str) -> str:
 
 
 def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[Domain, np.ndarray, float]:
-    """Choose the start surface of a fit. `choice`: the setting `domain`, which may be "auto".
+    """Make the start surface of a fit. Returns (domain, centre (3,), radius) of the normalising sphere [scene units].
 
-    Returns (domain, centre (3,) of the normalising sphere, its radius) [scene units]. Raises InputError if the surface
-    that `choice` names cannot be made.
+    `choice`: "auto", "hull", "sphere", or a tuple with the path of a mesh file. "auto" is the surface of the scene file
+    if it has one, otherwise the visual hull or a sphere. Raises InputError if the surface cannot be made.
     """
     shape = capture.shape
     if isinstance(choice, tuple):
@@ -152,7 +159,10 @@ def starting_surface(capture: Capture, choice: str | tuple[str, Path]) -> tuple[
 
 
 def require_normalised(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
-    """Raise InputError if the start surface is far from the scene's normalising sphere, or of quite another size."""
+    """Raise InputError if the start surface is far from the normalising sphere, or much larger or smaller than it.
+
+    `center` (3,), `radius`: the normalising sphere [scene units]. `domain`: the start surface in units of this sphere.
+    """
     low, high = domain.points.min(0), domain.points.max(0)
     size = float((high - low).max()) / 2
     if size <= 1 / DISPROPORTIONATE or np.abs(domain.points).max() >= DISPROPORTIONATE:
@@ -165,7 +175,7 @@ def require_normalised(capture: Capture, domain: Domain, center: np.ndarray, rad
 def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarray, radius: float) -> None:
     """Raise InputError if a camera or its light is inside the start surface, or if a camera faces away from it.
 
-    `center` (3,), `radius`: the normalising sphere [scene units].
+    `center` (3,), `radius`: the normalising sphere [scene units]. `domain`: the start surface in units of this sphere.
     """
     cameras, lights = [shot.camera for shot in capture.shots], capture.photographs.lights
     surface = center + radius * domain.points
@@ -186,7 +196,7 @@ def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarr
 
 
 def require_networks(ring: FittedObject) -> None:
-    """Raise InputError if Shape-Net or BRDF-Net of an object returns tensors of wrong shape."""
+    """Raise InputError if Shape-Net or BRDF-Net of an object returns a tensor of wrong shape."""
     s = torch.zeros(2, 3, device=next(ring.parameters()).device)
     with torch.no_grad():
         moved = ring.shape_net(s)

@@ -15,11 +15,11 @@ from mi_ring.fitting.problem import Problem
 def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
     """Collect the content of calibration.json. Writes no file.
 
-    `refined`: the calibrated capture. `deviations`: result of `covariance`. Returns a dictionary with these keys.
-    `refined`: list of the refined options. `light`: kind of the light. `unknowns`: by name, for each unknown that
-    photographs share, its meaning (`what`), its value `before` and `after` the fit, and its standard deviation `std`
-    for a fixed surface (not for the room's light). `photographs`: by name, for each fitted photograph, how far the
-    object has moved in it (`moved_px`) and its own unknowns.
+    `refined`: the calibrated capture. `deviations`: a dict from names of unknowns to their standard deviations. Returns
+    a dict with these keys. `refined`: list of the refined options. `light`: kind of the light. `unknowns`: a dict with,
+    for each unknown that photographs share, its meaning (`what`), its value `before` and `after` the fit, and its
+    standard deviation `std` for a fixed surface (not for the room's light). `photographs`: a dict with, for each fitted
+    photograph, how far the object has moved in it (`moved_px`) and the values of its own unknowns.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None

@@ -20,7 +20,10 @@ REGULARISED_POINTS = 512  #: points on the flow's paths, drawn anew in each iter
 
 
 class Term(NamedTuple):
-    """A term of the loss: a function, its weight, and a factor of the weight that changes during the fit."""
+    """A term of the loss: a function of an iteration, and a weight.
+
+    `schedule`: a factor of the weight, which changes during the fit; None: 1.
+    """
 
     function: Callable[[Iteration], Tensor | None]  #: its value, a scalar; None: it does not apply this time
     weight: float = 1.0  #: used if `Config.weights` has none of its name; 0 switches the term off
@@ -39,8 +42,8 @@ def rgb(it: Iteration) -> Tensor:
 def mask(it: Iteration) -> Tensor | None:
     """Compute the term `mask`: the difference between predicted silhouettes and masks.
 
-    Returns None if no photograph of the batch has a mask. In a lit room masks may be wrong, for example contain a
-    shadow. So large differences count less there in the second half of the fit.
+    Returns None if no photograph of the batch has a mask. In a lit room a mask may be wrong: for example, it may
+    contain a shadow. So large differences count less there in the second half of the fit.
     """
     seen, context = it.observation, it.context
     masked = float(it.batch.share.sum(seen.masked.sum()))
@@ -59,9 +62,9 @@ def mask(it: Iteration) -> Tensor | None:
 
 
 def velocity(it: Iteration) -> Tensor | None:
-    """Compute the term `velocity`, L_reg, at random points on the paths of domain points.
+    """Compute the term `velocity`, the paper's L_reg, at random points on the paths of domain points through the flow.
 
-    Returns None while the surface is fixed.
+    Returns None in the last stage, when the surface is fixed.
     """
     if it.stage.settles:
         return None
@@ -77,7 +80,7 @@ def velocity(it: Iteration) -> Tensor | None:
 
 
 def calibration(it: Iteration) -> Tensor | None:
-    """Compute the term `calibration`: the prior of the unknowns of calibration. None if there are no unknowns."""
+    """Compute the term `calibration`: the prior of the unknowns of calibration; None if nothing is refined."""
     calibration = it.context.model.calibration
     return calibration.prior() if calibration else None
 
@@ -85,7 +88,8 @@ def calibration(it: Iteration) -> Tensor | None:
 def settling(it: Iteration) -> Tensor | None:
     """Compute the term `settling`: the variation of the material along the surface.
 
-    It reduces slow variation, which is probably an effect of the light. Returns None until the surface is fixed.
+    It reduces slow variation, which is probably an effect of the light. Returns None until the last stage, when the
+    surface is fixed.
     """
     return priors.albedo_variation(it) if it.stage.settles else None
 
@@ -106,7 +110,7 @@ RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage",
 
 
 class Loss:
-    """The loss: the weighted sum of its terms. Call it with an `Iteration`."""
+    """The loss: the weighted sum of its terms. Call it with an `Iteration`. It returns a scalar tensor."""
 
     def __init__(self, terms: Mapping[str, TermLike] | None, weights: Mapping[str, float]) -> None:
         """Make a loss. `terms`: by name; None: `default_terms`. `weights`: by name of the term.
@@ -132,11 +136,14 @@ class Loss:
             raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
 
     def weight(self, name: str) -> float:
-        """Return the weight of the term `name` before scheduling; 0 if there is no such term."""
+        """Return the weight of the term `name`; 0 if there is no such term.
+
+        The factor that changes during the fit is not included.
+        """
         return self.weights.get(name, self.terms[name].weight) if name in self.terms else 0.0
 
     def require_velocity(self, shape_net: Flow) -> None:
-        """Raise InputError if the term `velocity` is used but `shape_net` has no velocity field."""
+        """Raise InputError if the term `velocity` is used but the network `shape_net` has no method `velocity`."""
         needed = self.terms.get("velocity") is default_terms["velocity"] and self.weight("velocity") > 0
         if needed and not hasattr(shape_net, "velocity"):
             raise InputError(f"networks: {type(shape_net).__name__}: has no velocity, which the term of that name "

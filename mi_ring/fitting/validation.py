@@ -23,7 +23,7 @@ PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per
 
 
 def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) -> float:
-    """Render held-out photographs. Returns the mean absolute error on the object, divided by the observed radiance.
+    """Render held-out photographs. Returns the mean absolute error on the object, divided by the mean observed value.
 
     Each prediction is first multiplied by the factor that fits its photograph best. `level`: level of the mesh. Returns
     NaN if no held-out photograph shows the object.
@@ -46,12 +46,12 @@ def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) 
 
 @torch.no_grad()
 def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Any]:
-    """Reset each option of `--refine` that does not improve the prediction of held-out photographs.
+    """Reset each option of `--refine` that does not improve the prediction of held-out photographs. Changes `model`.
 
     To reset an option is to give its unknowns the values of the capture. Options of single photographs are not reset.
-    Returns a dictionary. `put_back`: list of the reset options. `unexplained`: the error of the final model, see
-    `unexplained`. `before`: the same error with the capture's values for all unknowns. The last two are missing if no
-    held-out photograph shows the object; `before` is also missing if nothing is refined.
+    Returns a dict. `put_back`: list of the reset options. `unexplained`: mean relative error of the predictions after
+    that. `before`: the same error with the capture's values for all unknowns. The last two are missing if no held-out
+    photograph shows the object; `before` is also missing if nothing is refined.
     """
     calibration = model.calibration
 

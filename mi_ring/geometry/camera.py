@@ -1,4 +1,4 @@
-"""Cameras as numpy arrays, with or without lens distortion. `mi_ring.rendering.pinhole` does the same in Dr.Jit."""
+"""Cameras as numpy arrays, with or without lens distortion, and projections to their pictures."""
 
 from typing import Any, NamedTuple
 
@@ -14,11 +14,14 @@ FARTHEST = 50  #: sizes of the picture from which a principal point may be
 
 
 class NoParallax(InputError):
-    """Raised if all cameras are at one place or look along one line. The distance of the object is then unknown."""
+    """Raised if all cameras are at one place or look along one line, so that the distance of the object is unknown."""
 
 
 def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Return a camera-to-world pose (4, 4) in another frame: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+    """Return a camera-to-world pose (4, 4) after the motion x ↦ scale · rotation (3, 3) x + shift (3,) of the world.
+
+    Only the position is scaled. The result is again a rotation and a translation.
+    """
     moved = np.eye(4)
     moved[:3, :3] = rotation @ pose[:3, :3]
     moved[:3, 3] = scale * rotation @ pose[:3, 3] + shift
@@ -26,11 +29,11 @@ def moved_pose(pose: np.ndarray, scale: float, rotation: np.ndarray, shift: np.n
 
 
 def undistortion_factor(distortion: Any, distance2: Any) -> Any:
-    """Return the factor that removes distortion: multiply the vector from the picture's centre to a point by it.
+    """Return the factor that removes distortion: the vector from the principal point to a point is multiplied by it.
 
-    `distance2`: squared length of the distorted vector [focal lengths²]. The factor s solves s (1 + `distortion` s²
-    `distance2`) = 1. Newton's method finds it, if `distortion` · `distance2` is between `MIN_DISTORTION` and
-    `MAX_DISTORTION`. Arguments are arrays of numpy, torch or Dr.Jit.
+    `distortion`: first radial coefficient. `distance2`: squared length of the distorted vector [focal lengths²]. The
+    factor s solves s (1 + `distortion` s² `distance2`) = 1. Newton's method finds it, if `distortion` · `distance2` is
+    between `MIN_DISTORTION` and `MAX_DISTORTION`. Arguments are arrays of numpy, torch or Dr.Jit.
     """
     k = distortion * distance2
     factor = 1 / (1 + k)
@@ -40,19 +43,22 @@ def undistortion_factor(distortion: Any, distance2: Any) -> Any:
 
 
 def distortion_factor(distortion: Any, distance2: Any) -> tuple[Any, Any]:
-    """Return (factor, visible) for a point. Distortion multiplies the vector from the picture's centre by the factor.
+    """Return (factor, visible) for a point.
 
-    `distance2`: squared length of the undistorted vector [focal lengths²]. A point is not visible if it is beyond the
-    distance at which the lens folds. Arguments are arrays of numpy, torch or Dr.Jit.
+    Distortion multiplies the vector from the principal point to it by the factor. `distortion`: first radial
+    coefficient. `distance2`: squared length of the undistorted vector [focal lengths²]. `visible` is False for a point
+    so far out that a strongly distorting lens would fold the picture over. Arguments are arrays of numpy, torch or
+    Dr.Jit.
     """
     k = distortion * distance2
     return 1 + k, 1 + 3 * k > 0
 
 
 def distortion_range(focal: Any, centre: Any, size: Any) -> tuple[Any, Any]:
-    """Return the lowest and the highest distortion (...) that `undistortion_factor` can remove in the whole picture.
+    """Return the lowest and the highest distortion coefficient (...) that can be removed in the whole picture.
 
-    `focal`, `centre`, `size`: (..., 2) [px], arrays of numpy or torch.
+    `focal`: focal lengths. `centre`: principal point. `size`: width and height. All are (..., 2) [px], arrays of numpy
+    or torch.
     """
     corner = (abs(centre - size / 2) + size / 2) / focal
     corner2 = (corner**2).sum(-1)
@@ -60,7 +66,10 @@ def distortion_range(focal: Any, centre: Any, size: Any) -> tuple[Any, Any]:
 
 
 class Camera(NamedTuple):
-    """A camera. The picture spans [0, W] × [0, H], x right, y down. The centre of the first pixel is (0.5, 0.5)."""
+    """A camera. Its picture spans [0, W] × [0, H] [px], x right, y down.
+
+    The centre of the first pixel is (0.5, 0.5).
+    """
 
     to_world: np.ndarray  #: (4, 4) camera-to-world, Mitsuba's axes: x left, y up, z forward
     focal: np.ndarray  #: (2,) focal lengths [px]
@@ -86,27 +95,34 @@ class Camera(NamedTuple):
 
     @property
     def projection(self) -> np.ndarray:
-        """Matrix (3, 4) that maps (x, y, z, 1) to (pixel x · depth, pixel y · depth, depth). It ignores distortion."""
+        """Matrix (3, 4) that maps (x, y, z, 1) in the world to (pixel x · depth, pixel y · depth, depth).
+
+        Lens distortion is ignored.
+        """
         across = self.to_world[:3, :2] * -self.focal + np.outer(self.forward, self.centre)
         rows = np.column_stack([across, self.forward]).T
         return np.column_stack([rows, -rows @ self.position])
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the directions (n, 3) of the rays through pixel coordinates (n, 2), in the world, of length 1."""
+        """Return the world directions (n, 3), of length 1, of the rays through picture coordinates (n, 2) [px]."""
         x, y = self.undistorted((pixels - self.centre) / self.focal).T
         d = np.stack([-x, -y, np.ones_like(x)], 1) @ self.to_world[:3, :3].T
         return d / np.linalg.norm(d, axis=1, keepdims=True)
 
     def undistorted(self, places: np.ndarray) -> np.ndarray:
-        """Remove lens distortion from `places` (..., 2): vectors from the picture's centre [focal lengths]."""
+        """Remove lens distortion from points in the picture. Returns (..., 2) in the same unit.
+
+        `places` (..., 2): vectors from the principal point to the points [focal lengths].
+        """
         if not self.distortion:
             return places
         return places * undistortion_factor(self.distortion, np.square(places).sum(-1, keepdims=True))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project points (n, 3). Returns pixel coordinates (n, 2) and depths (n,) along the optical axis [scene units].
+        """Project points (n, 3) in the world. Returns pixel coordinates (n, 2) and depths (n,) along the optical axis.
 
-        Pixel coordinates are NaN for a point beyond the distance from the centre at which the lens folds.
+        Depths are in scene units; points behind the camera have negative ones. Pixel coordinates are NaN for a point so
+        far out that a strongly distorting lens would fold the picture over.
         """
         x, y, z = np.linalg.solve(self.to_world[:3, :3], (points - self.position).T)
         with np.errstate(divide="ignore", invalid="ignore"):  # the depth may be 0
@@ -123,7 +139,7 @@ class Camera(NamedTuple):
         return (1 + np.square(places).sum(-1)) ** -0.5
 
     def shrunk(self, scale: int) -> "Camera":
-        """Return the camera of the same photograph at 1 / `scale` of its size."""
+        """Return the camera of a reduced photograph. Width and height are divided by `scale`, a whole number."""
         size = self.size[0] // scale, self.size[1] // scale
         return self._replace(focal=self.focal / scale, centre=self.centre / scale, size=size)
 
@@ -133,7 +149,7 @@ class Camera(NamedTuple):
         return tuple(np.asarray(part).tobytes() for part in self)
 
     def fault(self) -> str | None:
-        """Return what is wrong with principal point, distortion or pose, as text. None if nothing is wrong.
+        """Describe as text what is wrong with principal point, distortion or pose. Returns None if nothing is wrong.
 
         The text uses the names of fields in scene files.
         """
@@ -153,7 +169,10 @@ class Camera(NamedTuple):
 
 
 def usable_camera(camera: Camera | None, what: str) -> Camera:
-    """Check a camera and round its numbers to float32. Raises InputError; `what` begins the message."""
+    """Check a camera, and return it with its numbers rounded to float32.
+
+    Raises InputError if it is no camera or has invalid numbers. The message begins with `what`, the name of the camera.
+    """
     if not isinstance(camera, Camera):
         raise InputError(f"{what}: is {type(camera).__name__}; must be a mi_ring.Camera")
     to_world, focal, centre, distortion, sides = (
@@ -176,8 +195,8 @@ def usable_camera(camera: Camera | None, what: str) -> Camera:
 def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.ndarray:
     """Return the point (3,) that is nearest to several lines in the least-squares sense.
 
-    The lines are `origins` (n, 3) + t · `directions` (n, 3). Raises NoParallax if they do not determine a point. The
-    message begins with `what`.
+    The lines are `origins` (n, 3) + t · `directions` (n, 3), unit vectors. Raises NoParallax if they do not determine a
+    point. The message begins with `what`.
     """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     matrix, right = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]

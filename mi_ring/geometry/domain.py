@@ -22,10 +22,11 @@ MAX_SAMPLES = 2**20  #: most points to take candidates from; from level 6 on, so
 def closed_domain(
     mesh: trimesh.Trimesh, center: ArrayLike | None = None, radius: float | None = None
 ) -> tuple["Domain", np.ndarray, float]:
-    """Make a domain of a closed mesh. Returns (domain, centre (3,), radius) of the normalising sphere.
+    """Make a domain of a closed mesh. Returns (domain, centre (3,) and radius of the sphere that normalises it).
 
-    Centre and radius are in units of the mesh. By default, the centre is that of the bounding box, and the radius is
-    the mean distance of the vertices from it. If `mesh` is inside out, its faces are flipped.
+    The domain is the surface (mesh − centre) / radius. Default of `center`: centre of the bounding box. Default of
+    `radius`: mean distance of the vertices from the centre. Both are in units of the mesh. If `mesh` is inside out, its
+    faces are flipped in place.
     """
     if mesh.volume < 0:
         mesh.invert()
@@ -35,9 +36,10 @@ def closed_domain(
 
 
 def transfer_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Move `points` (N, 3) of a mesh together with the mesh, and return them (N, 3).
+    """Find the place of points (N, 3) of a mesh after its vertices have moved. Returns (N, 3).
 
-    The mesh's `vertices` (V, 3) move to `others` (V, 3). Points that are not on the mesh are first projected to it.
+    `vertices` (V, 3), `faces` (F, 3): the mesh before. `others` (V, 3): its vertices after. A point keeps its
+    barycentric coordinates. Points that are not on the mesh are first projected to it.
     """
     mesh = vertices.astype(float), faces.astype(np.int32)
     _, face, weights = gpytoolbox.squared_distance(points.astype(float), *mesh, use_cpp=True)
@@ -51,17 +53,19 @@ def normalized(vectors: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def samplings(kind: str, points: bytes, faces: bytes) -> tuple[dict, dict]:
-    """Return two dicts by level, for meshes and for candidates. All domains of one surface share them.
+    """Return two dicts that all domains of one surface share: meshes by level, and random surface points by level.
 
-    They are shared because it takes seconds to remesh a hull.
+    They are empty at first. `kind`, `points`, `faces`: type and mesh of the domain, as a key. They are shared because
+    it takes seconds to remesh a surface.
     """
     return {}, {}
 
 
 class Domain:
-    """A closed surface in the normalised frame, given as a mesh with vertices (V, 3) and faces (F, 3).
+    """A closed surface in the normalised frame, in which it is about as large as the unit sphere.
 
-    `sample` returns other meshes of the same surface. Their triangles are nearly uniform.
+    It is given as a mesh with vertices (V, 3) and faces (F, 3). The method `sample` returns other meshes of the same
+    surface, whose triangles are nearly equal in size.
     """
 
     def __init__(self, points: ArrayLike, faces: ArrayLike) -> None:
@@ -74,8 +78,9 @@ class Domain:
     def sample(self, level: int, random: torch.Generator | None = None) -> tuple[Tensor, np.ndarray]:
         """Return a mesh of the surface: vertices (V, 3) and faces (F, 3).
 
-        F is about 20 · 4^level, as in an icosphere of this level. If `random` is given, each call moves the vertices to
-        other points of the surface. The faces stay the same.
+        F is about 20 · 4^level, as in an icosphere of this level. `random`: each call moves the vertices to other
+        points of the surface; None: the vertices of a level are always the same. The faces of a level are always the
+        same.
         """
         if level not in self.levels:
             vertices, triangles = self.triangulate(level)
@@ -84,7 +89,7 @@ class Domain:
         return (points if random is None else self.resample(level, points, random)), faces
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return which points (N, 3) are inside the surface: (N,) bool."""
+        """Test which points (N, 3) are inside the surface. Returns (N,) bool."""
         inside = np.linalg.norm(points, axis=1) < np.linalg.norm(self.points, axis=1).max()
         if inside.any():
             mesh = self.points.astype(float), self.faces.astype(np.int32)
@@ -96,7 +101,7 @@ class Domain:
         return transfer_points(points, self.points, self.faces, self.points)
 
     def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Make a mesh of the surface with about 20 · 4^level triangles. Returns (vertices, faces)."""
+        """Make a mesh of the surface with about 20 · 4^level triangles. Returns (vertices (V, 3), faces (F, 3))."""
         if level > REMESHED:
             points, faces = trimesh.remesh.subdivide(*self.sample(level - 1))
             return self.project(points), faces
@@ -118,14 +123,20 @@ class Domain:
         return points, faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """Return new positions (V, 3) of the vertices. Each is a random one of the vertex's candidates."""
+        """Return new positions (V, 3) for the vertices of a level's mesh: random surface points near the old positions.
+
+        `points` (V, 3): the old positions.
+        """
         if level not in self.candidates:
             self.candidates[level] = self.find_candidates(level)
         chosen = torch.randint(CANDIDATES, (len(points),), generator=random)
         return self.candidates[level][torch.arange(len(points)), chosen]
 
     def find_candidates(self, level: int) -> Tensor:
-        """Return random points (V, CANDIDATES, 3) of the surface: candidates near each vertex of a level's mesh."""
+        """Return `CANDIDATES` random points of the surface near each vertex of a level's mesh: (V, CANDIDATES, 3).
+
+        If there are too few such points, some are repeated.
+        """
         points, faces = self.sample(level)
         coarse = trimesh.Trimesh(points.numpy(), faces, process=False)
         fine = trimesh.Trimesh(self.points, self.faces, process=False)
@@ -148,7 +159,7 @@ class Domain:
 
 
 class Sphere(Domain):
-    """The unit sphere. It is sampled as an icosphere: 2,562 / 10,242 / 40,962 / 163,842 vertices at levels 4–7."""
+    """The unit sphere. Its meshes are icospheres: 2,562 / 10,242 / 40,962 / 163,842 vertices at levels 4–7."""
 
     def __init__(self) -> None:
         icosahedron = trimesh.creation.icosahedron()
@@ -165,6 +176,6 @@ class Sphere(Domain):
         return mesh.vertices, mesh.faces
 
     def resample(self, level: int, points: Tensor, random: torch.Generator) -> Tensor:
-        """Return the vertices (V, 3), all rotated by the same random rotation of the sphere."""
+        """Return the vertices `points` (V, 3), all rotated by the same random rotation about the centre."""
         rotation = Rotation.from_quat(torch.randn(4, generator=random).numpy()).as_matrix()
         return points @ torch.as_tensor(rotation, dtype=torch.float32).T

@@ -24,7 +24,10 @@ class NoHull(InputError):
 
 
 class Silhouette(NamedTuple):
-    """A mask and its camera."""
+    """A mask and its camera.
+
+    If the mask is of a part of a photograph, `frame` gives the corners of the whole photograph.
+    """
 
     mask: np.ndarray  #: (H, W) uint8, object above 127
     camera: Camera
@@ -34,7 +37,10 @@ class Silhouette(NamedTuple):
 
     @property
     def whole(self) -> "Silhouette":
-        """The silhouette of the whole photograph. If this silhouette is a part of it, the rest of its mask is empty."""
+        """The silhouette of the whole photograph.
+
+        If this silhouette shows only a part of it, the rest of the mask becomes empty.
+        """
         if self.frame is None:
             return self
         before = np.ceil(-self.frame[0]).astype(int)
@@ -47,7 +53,7 @@ class Silhouette(NamedTuple):
 
 
 def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Reduce a mask (H, W) uint8 by a whole factor, so that it is at most `width` [px] wide. Returns (mask, factor)."""
+    """Reduce a mask (H, W) uint8 by a whole factor, to at most `width` [px] wide. Returns (mask, factor)."""
     scale = -(-mask.shape[1] // width)
     height, width = (n // scale for n in mask.shape)
     blocks = mask[: height * scale, : width * scale].reshape(height, scale, width, scale)
@@ -55,7 +61,7 @@ def shrink_mask(mask: np.ndarray, width: int) -> tuple[np.ndarray, int]:
 
 
 def small_silhouette(silhouette: Silhouette, width: int = MAX_WIDTH) -> Silhouette:
-    """Return a silhouette that is reduced to at most this `width` [px]."""
+    """Return a copy of a silhouette, mask and camera, that is reduced to at most `width` [px] wide."""
     mask, scale = shrink_mask(silhouette.mask, width)
     valid = None if silhouette.valid is None else shrink_mask(silhouette.valid, width)[0]
     frame = None if silhouette.frame is None else silhouette.frame / scale
@@ -63,7 +69,7 @@ def small_silhouette(silhouette: Silhouette, width: int = MAX_WIDTH) -> Silhouet
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """Return at most `most` indices, evenly spaced in 0 … count − 1."""
+    """Return at most `most` indices, evenly spaced in 0 … `count` − 1."""
     number = min(most, count)
     return [k * count // number for k in range(number)]
 
@@ -77,8 +83,8 @@ class Hull:
     """The visual hull of silhouettes. Raises InputError if a silhouette is empty.
 
     `center` (3,) and `reach` are the centre and the radius of a ball that contains the hull [scene units]. `outliers`:
-    a point of the hull may be outside this share of the silhouettes. A few wrong masks then do no harm. Messages about
-    the cameras begin with `what`.
+    a point may be outside this share of the silhouettes and still belong to the hull, so that a few wrong masks do no
+    harm. `what`: name of the capture, at the beginning of error messages.
     """
 
     def __init__(self, silhouettes: Sequence[Silhouette], what: str, outliers: float = 0.02) -> None:
@@ -93,7 +99,10 @@ class Hull:
 
     @staticmethod
     def rays(silhouette: Silhouette) -> np.ndarray:
-        """Return the directions (n, 3), of length 1, of the rays through the pixels of a mask."""
+        """Return the world directions (n, 3), of length 1, of the rays through the object's pixels of a mask.
+
+        Raises InputError if the mask is empty.
+        """
         rows, columns = np.nonzero(silhouette.mask > 127)
         if not len(rows):
             raise InputError(f"{silhouette.name}: mask: is empty, or nearly: no pixels above 127")
@@ -102,9 +111,9 @@ class Hull:
     def depth(self, points: Tensor) -> Tensor:
         """Return the approximate signed distance (N,) of points (N, 3) from the hull's surface, positive inside.
 
-        The distance is in scene units. For each silhouette, the distance from its outline is computed at the depth of
-        the point. The result is the smallest of these distances, without the outliers. A photograph that does not show
-        the point does not count. A point that few photographs show is outside.
+        It is in scene units. For each silhouette, it is the distance of the projected point from the outline, at the
+        depth of the point. The result is the smallest of these distances, after a few outliers are left out. A
+        photograph that does not show the point does not count. A point that few photographs show is outside.
         """
         worst = math.floor(self.outliers * len(self.silhouettes)) + 1
         lowest, shown = torch.full((worst, len(points)), torch.inf), torch.zeros(len(points))
@@ -136,11 +145,11 @@ class Hull:
     def shortfall(
         self, of: Sequence[Silhouette] | None = None, pixels: int = 100, samples: int = 64, outline: bool = False
     ) -> np.ndarray:
-        """Return how far silhouettes reach beyond the projected hull: (N, pixels) [px].
+        """Return how far N silhouettes reach beyond the projected hull: (N, pixels) [px]. 0: not at all.
 
-        Each value is the distance of the hull from the ray through a random pixel of a mask. `pixels`: number of rays
-        for each mask. `samples`: number of points on a ray at which the distance is computed. `of`: the N silhouettes;
-        default: those of the hull. `outline`: take pixels only from the outline of the mask.
+        Each value is the distance of the hull from the ray through a random pixel of a mask. `of`: the N silhouettes;
+        None: those of the hull. `pixels`: number of rays for each mask. `samples`: number of points on a ray at which
+        the distance is computed. `outline`: True takes pixels only from the outline of the mask.
         """
         random, result = np.random.default_rng(0), []
         along = torch.linspace(-self.reach, self.reach, samples)[:, None]
@@ -159,17 +168,23 @@ class Hull:
         return np.array(result)
 
     def grid(self, low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[Tensor, tuple[int, ...]]:
-        """Return the points (N, 3) of a grid between the corners `low` (3,) and `high` (3,), and the grid's shape."""
+        """Return the points (N, 3) of a regular grid, and the grid's shape (number of points along x, y and z).
+
+        `low` (3,), `high` (3,): lowest and highest corner. `spacing`: distance of neighbours. All are in scene units.
+        """
         axes = [torch.as_tensor(np.arange(a, b + spacing, spacing), dtype=torch.float32) for a, b in zip(low, high)]
         return torch.cartesian_prod(*axes), tuple(map(len, axes))
 
     def require(self, inside: int) -> None:
-        """Raise NoHull if `inside`, the number of points found inside, is 0."""
+        """Raise NoHull if `inside`, the number of grid points inside the hull, is 0."""
         if not inside:
             raise NoHull(f"{self.what}: mask: no point in space is inside all masks; check to_world, fx, fy, cx, cy")
 
     def ball(self, resolution: int = 48) -> tuple[np.ndarray, float]:
-        """Return the hull's centre of mass (3,), and the radius of the ball of equal volume [scene units]."""
+        """Return the hull's centre of mass (3,), and the radius of a ball of the same volume [scene units].
+
+        `resolution`: points of the grid along each side. Raises NoHull if the hull is empty.
+        """
         spacing = 2 * self.reach / (resolution - 1)
         points, _ = self.grid(self.center - self.reach, self.center + self.reach, spacing)
         inside = points[self.depth(points) > 0].double()
@@ -177,9 +192,9 @@ class Hull:
         return inside.mean(0).numpy(), (3 * len(inside) * spacing**3 / (4 * math.pi)) ** (1 / 3)
 
     def surface(self, resolution: int = 128) -> trimesh.Trimesh:
-        """Return the closed surface of the hull's largest piece [scene units]. It is found by marching cubes.
+        """Return the closed surface of the hull's largest piece, a mesh in scene units. It is found by marching cubes.
 
-        `resolution`: number of cells along the longest side.
+        `resolution`: number of grid cells along the longest side. Raises NoHull if the hull is empty.
         """
         low, high = self.center - self.reach, self.center + self.reach
         spacing = 2 * self.reach / 64

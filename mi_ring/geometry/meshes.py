@@ -14,9 +14,9 @@ JSON = 2**24  #: bytes at the beginning of a glTF file in which its extensions a
 
 
 def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
-    """Read a mesh from a file, and close its seams by joining equal vertices.
+    """Read a mesh from a file. Vertices at the same place are joined, so that seams of textures are closed.
 
-    Raises InputError if this fails. The message names the `field`.
+    Raises InputError if the file cannot be read. The message contains `field`, the option or field that names the file.
     """
     require_file(path, "the file of a mesh", field)
     with reading(f"{path}: {field}", "a mesh"):
@@ -34,9 +34,10 @@ def read_mesh(path: Path, field: str) -> trimesh.Trimesh:
 
 
 def load_closed_mesh(path: Path, field: str) -> trimesh.Trimesh:
-    """Read a closed mesh from a file.
+    """Read a closed mesh from a file. Vertices at the same place are joined, so that seams of textures are closed.
 
-    Raises InputError if this fails or if the mesh is not closed. The message names the `field`.
+    Raises InputError if the file cannot be read or the mesh is not closed. The message contains `field`, the option or
+    field that names the file.
     """
     mesh = read_mesh(path, field)
     if not (mesh.is_watertight and mesh.is_winding_consistent):
@@ -45,5 +46,5 @@ def load_closed_mesh(path: Path, field: str) -> trimesh.Trimesh:
 
 
 def genus(mesh: trimesh.Trimesh) -> int:
-    """Return the number of handles of a closed surface, summed over its pieces."""
+    """Return the number of handles of a closed surface: 0 for a sphere, 1 for a torus. Several pieces are summed."""
     return mesh.body_count - mesh.euler_number // 2

@@ -5,10 +5,10 @@ from torch import Tensor
 
 
 def quarter_turns(places: Tensor, near: float) -> Tensor:
-    """Return rotations (P, 3, 3) by multiples of 90° about the optical axis.
+    """Choose rotations by multiples of 90° about the z axis, each of which moves the first point near another point.
 
-    Each moves the first of `places` (P, 3) as near as possible to one of `places`. For a place that is closer than
-    `near` to the first, the rotation is the identity.
+    `places` (P, 3): the points. Returns P matrices (P, 3, 3). Each moves the first point as near as possible to one of
+    the points. It is the identity if both are closer than `near` anyway.
     """
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(places)
     turns = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])

@@ -1,4 +1,4 @@
-"""A map between a domain and the unit sphere. With it, points of different domains correspond to each other."""
+"""A map between a domain and the unit sphere. With two such maps, points of two domains correspond to each other."""
 
 import numpy as np
 import trimesh
@@ -14,7 +14,7 @@ STEPS, STEP = 40, 0.1  #: number and length of the steps of the curvature flow, 
 
 
 class SphericalMap:
-    """A conformal one-to-one map between a domain and the unit sphere, with as little rotation as possible.
+    """A conformal one-to-one map between a domain and the unit sphere. It rotates the domain as little as possible.
 
     Raises InputError if the domain has handles or several pieces. The message begins with `name`.
     """
@@ -49,9 +49,9 @@ class SphericalMap:
 def sphere_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Map the vertices (V, 3) of a closed surface without handles conformally to the unit sphere. Returns (V, 3).
 
-    The method is "Can Mean-Curvature Flow Be Made Non-Singular?" (Kazhdan, Solomon and Ben-Chen, SGP 2012). It is mean
-    curvature flow with the Laplacian of the first surface in all steps. It pinches off no limb, and it ends on a
-    sphere.
+    The method is "Can Mean-Curvature Flow Be Made Non-Singular?" (Kazhdan, Solomon and Ben-Chen, SGP 2012): mean
+    curvature flow that keeps the Laplacian of the given surface in all steps. It does not pinch off thin parts, and
+    ends on a sphere.
     """
     laplacian = gpytoolbox.cotangent_laplacian(points, faces)
     x = points

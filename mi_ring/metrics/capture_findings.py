@@ -20,9 +20,10 @@ FAR, LEAST_FAR = 4.0, 2.0  #: a camera has moved far: more than this multiple of
 
 
 def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
-    """Name the photographs whose camera a fit has moved much farther than the others. Returns a text for the user.
+    """Name the photographs whose camera a fit has moved much farther than the others.
 
-    The text is empty if there are no such photographs. `photographs`: the entry of this name in calibration.json.
+    `photographs`: the entry of this name in calibration.json: a dict from names of photographs to their values. Returns
+    a text for the user; empty if there are no such photographs.
     """
     moved = {name: entry["moved_px"] for name, entry in photographs.items()}
     limit = max(LEAST_FAR, FAR * float(np.median(list(moved.values()) or [0])))
@@ -30,9 +31,10 @@ def moved_far(photographs: dict[str, dict[str, Any]]) -> str:
 
 
 def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
-    """Name the photographs whose light, by a fit, is much stronger or weaker than the others' lights.
+    """Name the photographs whose light, as a fit has found it, is much stronger or weaker than the others' lights.
 
-    Argument and result: as for `moved_far`.
+    `photographs`: the entry of this name in calibration.json: a dict from names of photographs to their values. Returns
+    a text for the user; empty if there are no such photographs.
     """
     powers = {name: float(np.exp(np.log(e["power"]).mean())) for name, e in photographs.items() if "power" in e}
     odd = {name: power for name, power in powers.items() if not 1 / ODD_POWER < power < ODD_POWER}
@@ -40,9 +42,10 @@ def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
 
 
 def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
-    """Read calibration.json beside a scene file. Returns the texts (`moved_far`, `odd_powers`) about photographs.
+    """Read calibration.json beside a scene file, which a fit has written. Returns two texts for the user.
 
-    `names`: the photographs of the capture. Both texts are empty if there is no such file.
+    They name the photographs whose camera the fit has moved far, and those whose light is much stronger or weaker than
+    the others. `names`: only these photographs count. Both texts are empty if there is no such file.
     """
     record = read_json(scene.parent / "calibration.json")
     try:
@@ -83,10 +86,10 @@ agreement: share of the mask that the other masks agree with"""
 def measure(
     capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]
 ) -> list[PhotographQuality]:
-    """Measure the quality of each photograph. Reads all photographs.
+    """Measure the quality of each photograph. Reads all photographs. Returns one row for each.
 
-    `center` (3,), `radius`: normalising sphere [scene units]. `agreement`: share of each mask that the other masks
-    confirm, by file; from `mask_agreement.agreements`.
+    `center` (3,), `radius`: normalising sphere [scene units]. `agreement`: a dict from the name of a mask file to the
+    share of this mask that the other masks confirm.
     """
     lights, rows = capture.photographs.lights, []
     lit = np.any(lights.rgb() > 0, axis=1)
@@ -115,16 +118,19 @@ def measure(
 
 
 def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
-    """Compute the irradiance (N,) at the object in each photograph; 1 in all if the lights are unknown.
+    """Compute the irradiance (N,) at the object in each photograph, from the known lights, as a mean over colours.
 
-    `center` (3,): centre of the object.
+    `center` (3,): centre of the object [scene units]. If the lights are unknown, all values are 1.
     """
     received = capture.photographs.irradiance(center).mean(1)
     return received if np.median(received) > 0 else np.ones_like(received)
 
 
 def units(capture: Capture, center: np.ndarray) -> str | None:
-    """Return a warning for the user if lights and cameras seem to have different length units; otherwise None."""
+    """Return a warning for the user if lights and cameras seem to have different length units; otherwise None.
+
+    `center` (3,): centre of the object [scene units].
+    """
     lights, point = capture.photographs.lights.positions(), capture.photographs.lights.is_finite()
     cameras = np.stack([shot.camera.position for shot in capture.shots])
     if not point.any() or np.ptp(cameras, axis=0).max() == 0:
@@ -141,7 +147,10 @@ def units(capture: Capture, center: np.ndarray) -> str | None:
 
 
 def facing(capture: Capture, center: np.ndarray) -> str | None:
-    """Return a warning for the user if cameras face away from the object, at `center` (3,); otherwise None."""
+    """Return a warning for the user if cameras look away from the object; otherwise None.
+
+    `center` (3,): centre of the object [scene units].
+    """
     cameras = [shot.camera for shot in capture.shots]
     away = np.array([(center - camera.position) @ camera.forward < 0 for camera in cameras])
     if away.mean() > 0.5:
@@ -151,11 +160,11 @@ def facing(capture: Capture, center: np.ndarray) -> str | None:
 
 
 def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
-    """Estimate how much of the light on the object is room light: a lower bound of the share, 0 to 1.
+    """Estimate the share of the light on the object that comes from the room, 0 to 1. It is a lower bound.
 
-    `brightness` (n,): brightness of the object in each photograph, divided by `received`. `received` (n,): irradiance
-    by the known lights. Room light does not depend on the distance of the flash. So if there is room light, the object
-    looks too bright where `received` is small.
+    `received` (n,): irradiance at the object by the known lights, in each photograph. `brightness` (n,): brightness of
+    the object in each photograph, divided by `received`. Room light does not depend on the distance of the flash. So if
+    there is room light, the object looks too bright where `received` is small.
     """
     if len(received) < 12 or received.max() < 1.5 * received.min():
         return 0.0
@@ -166,9 +175,9 @@ def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
 
 
 def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np.ndarray) -> list[str]:
-    """List the problems of a capture, each as a sentence for the user. `rows`: result of `measure`.
+    """List the problems of a capture, each as a sentence for the user. Reads calibration.json if a fit has written it.
 
-    `center` (3,): centre of the object.
+    `rows`: measured quality of each photograph. `center` (3,): centre of the object [scene units].
     """
     found: list[str] = []
     agree = [row.agreement for row in rows if row.agreement is not None]
@@ -210,7 +219,7 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
 
 
 def quality_table(rows: list[PhotographQuality]) -> str:
-    """Format the rows as a text table with a legend. The table shows brightness relative to the median."""
+    """Format the quality of photographs as a text table with a legend. It shows brightness relative to the median."""
     typical = float(np.median([row.brightness for row in rows]))
     lines = [["photograph", *FORMATS]]
     for row in rows:
@@ -225,7 +234,10 @@ def quality_table(rows: list[PhotographQuality]) -> str:
 
 
 def without_empty_masks(capture: Capture) -> tuple[Capture, list[str]]:
-    """Remove empty masks from a capture. Returns (new capture, names of the photographs with an empty mask)."""
+    """Remove empty masks from a capture. Returns (copy of the capture, names of the photographs with an empty mask).
+
+    In the copy, these photographs have no mask.
+    """
     given = [k for k, is_given in enumerate(capture.masks.given) if is_given]
     empty = [k for k in given if not (shrink_mask(capture.masks[k], MAX_WIDTH)[0] > 127).any()]
     masks = capture.masks.replaced(dict.fromkeys(empty))

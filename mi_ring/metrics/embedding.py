@@ -1,6 +1,6 @@
-"""Tests whether a surface is an embedding: a surface without inverted triangles and without crossing triangles.
+"""Tests whether a surface is an embedding: it has no inverted triangles, and it does not cross itself.
 
-An exactly solved flow makes an embedding.
+A flow that is computed exactly makes an embedding.
 """
 
 import numpy as np
@@ -14,10 +14,10 @@ STEP = 1e-3  #: distance from a triangle of the points on its two sides, in the 
 
 
 def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.ndarray:
-    """Find the triangles that Shape-Net flattens or turns inside out. Returns (F,) bool.
+    """Find the triangles that Shape-Net flattens or turns inside out. Returns (F,) bool: True for such a triangle.
 
     `s` (V, 3), `faces` (F, 3): a mesh of the domain. Shape-Net moves a point on the outer side of such a triangle to
-    the inner side. For infinitely small triangles this means det ∂Φ/∂s ≤ 0, which is impossible for an exactly solved
+    the inner side. For infinitely small triangles this means det ∂Φ/∂s ≤ 0, which is impossible for an exactly computed
     flow.
     """
     s = s.to(ring.center.device)
@@ -34,9 +34,10 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
 
 
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Find the triangles that cross, overlap or touch other triangles, in exact arithmetic. Returns (F,) bool.
+    """Find the triangles that intersect another triangle, in exact arithmetic.
 
-    Raises InputError if the package libigl is not installed.
+    Returns (F,) bool: True for such a triangle. Neighbours do not count, as long as they have only their common edge or
+    vertex in common. All other contacts count. Raises InputError if the package libigl is not installed.
     """
     need("igl", "the exact count of crossing triangles", "libigl")
     from igl.copyleft.cgal import remesh_self_intersections

@@ -34,12 +34,12 @@ def evaluate(
     run: str | Path, mesh: str | Path, novel: str | Path | None = None, spp: int = SPP, seen: bool = False,
     align: str | None = None,
 ) -> dict:  # fmt: skip
-    """Compare a fit with the truth. Renders photographs. Returns a dictionary of numbers by name.
+    """Compare a fit with the truth. Renders photographs. Returns a dict from names to numbers. Writes no file.
 
     `run`: results folder of the fit. `mesh`: file of the true surface. `novel`: scene file of photographs that the fit
-    has not used. `spp`: samples per pixel of predicted photographs. `seen`: measure distances between surfaces only
-    where a photograph shows them. `align`: "rigid" or "similarity": first align the truth and `novel` with the fit; the
-    numbers `aligned_…` describe this motion.
+    has not used. `spp`: samples per pixel of predicted photographs. `seen`: True measures distances between surfaces
+    only where a photograph shows them. `align`: "rigid" or "similarity" first align the truth and `novel` with the fit;
+    the numbers `aligned_…` describe this motion. None: no alignment.
 
     Numbers that end in `_input` are about fitted photographs, those in `_held_out` about held-out photographs, those in
     `_novel` about `novel`. `views` and `novel_views` are lists with the numbers of each photograph. A number that is
@@ -90,7 +90,7 @@ def evaluate(
 
 
 def evaluation_table(numbers: dict[str, float]) -> str:
-    """Format the `numbers` of `evaluate` as a text table."""
+    """Format the numbers that describe a whole fit as a text table. `numbers`: a dict from names to numbers."""
     lines = []
     for start, words in LINES.items():
         found = {key.removeprefix(start).strip("_"): value for key, value in numbers.items() if key.startswith(start)}

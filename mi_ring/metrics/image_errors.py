@@ -19,12 +19,12 @@ WINDOW = 11  #: width of the window of SSIM [px]
 def compare_photographs(
     capture: Capture, ring: FittedObject, spp: int, index: Sequence[int] | None = None
 ) -> tuple[dict[str, float], list[dict]]:
-    """Predict photographs and compare the predictions with the photographs.
+    """Render photographs of the object `ring`, and compare them with the photographs of the capture.
 
-    `index`: the photographs; default: all. `spp`: samples per pixel. Returns ({`psnr` [dB], `ssim`} of all photographs,
-    list of such dictionaries with the `name` of each photograph). Predictions are 8-bit sRGB, as mi-ring render writes
-    them. Only `comparable` pixels count. The total PSNR is that of the mean squared error, and the total SSIM is the
-    mean. `psnr` is missing if the prediction is exact.
+    `index`: the photographs to compare; None: all. `spp`: samples per pixel. Returns (totals, list with one dict for
+    each photograph). Totals are `psnr` [dB] of the mean squared error and the mean `ssim`; each photograph has both and
+    its `name`. The comparison is in sRGB, with renderings rounded to 8 bits, at valid pixels; in a lit room, only
+    inside the mask. `psnr` is missing if there is no error.
     """
     surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
@@ -49,9 +49,9 @@ def compare_photographs(
 
 
 def comparable(capture: Capture, seen: Observation) -> np.ndarray:
-    """Find the pixels (H, W) bool of the first photograph to compare.
+    """Return a boolean mask (H, W) of the pixels at which the first photograph of `seen` is compared with a rendering.
 
-    They are valid and, in a lit room, inside the mask if there is one.
+    It is True for valid pixels. In a lit room, it is True only inside the mask, if there is one.
     """
     valid = np.ones(seen.mask.shape[1:], bool) if seen.valid is None else seen.valid[0].numpy()
     return valid & (seen.mask[0].numpy() > 0.99) if seen.masked[0] and capture.lit_room else valid
@@ -63,10 +63,10 @@ def decibels(square: float) -> dict[str, float]:
 
 
 def ssim(a: np.ndarray, b: np.ndarray, compared: np.ndarray | None = None) -> dict[str, float]:
-    """Compute the structural similarity of two images (H, W, 3) in [0, 1]. Returns {`ssim`: value}.
+    """Compute the structural similarity of two images (H, W, 3) in [0, 1]. Returns a dict: {`ssim`: value}.
 
-    Returns {} if the images are smaller than the window. The value is the mean over channels and over the pixels
-    `compared` (H, W) bool; None: over all pixels whose window is inside the image. The definition is that of Wang et
+    The value is the mean over channels and over the pixels `compared` (H, W) bool; None: over all pixels whose window
+    is inside the image. The dict is empty if the images are smaller than the window. The definition is that of Wang et
     al., Image Quality Assessment, IEEE TIP 2004: Gaussian window of 11 × 11 px, σ = 1.5 px.
     """
     if min(a.shape[:2]) < WINDOW:

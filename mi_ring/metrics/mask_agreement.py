@@ -1,4 +1,7 @@
-"""Tests whether the masks of a capture agree. If they do not, it looks for a mistake in cameras or masks."""
+"""Tests whether the masks of a capture agree. If they do not, it looks for a mistake in cameras or masks.
+
+A pixel of a mask is confirmed if its ray hits the visual hull of all masks.
+"""
 
 import copy
 from collections.abc import Sequence
@@ -15,10 +18,10 @@ AROUND = 0.9  #: share of a photograph's border above which a mask is that of th
 
 
 def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
-    """Test whether the masks of a capture agree.
+    """Test whether the masks of a capture agree. Returns (shares, problems).
 
-    Returns (by mask file, the share of the mask that all other masks confirm; list of problems, as sentences for the
-    user). Both are empty if the capture has no visual hull.
+    `shares`: a dict from mask files to the share of the mask that all other masks confirm. `problems`: sentences for
+    the user. Both are empty if the capture has no visual hull.
     """
     if not capture.hull:
         return {}, []
@@ -49,7 +52,10 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
 
 
 def with_camera(silhouette: Silhouette, **changed: Any) -> Silhouette:
-    """Return a copy of a silhouette whose camera has other values. `changed`: fields of the camera by name."""
+    """Return a copy of a silhouette with a changed camera.
+
+    `changed`: new values of the camera's fields, such as `focal=…`.
+    """
     return silhouette._replace(camera=silhouette.camera._replace(**changed))
 
 
@@ -80,7 +86,7 @@ OTHERS = {
 
 
 def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
-    """Compute the share of mask pixels that all masks confirm: the rays of these pixels hit the visual hull.
+    """Compute the share of mask pixels that all masks confirm: the rays through these pixels hit the visual hull.
 
     It is 0 if the hull is empty.
     """
@@ -91,13 +97,16 @@ def share_agreed(silhouettes: Sequence[Silhouette]) -> float:
 
 
 def border(silhouette: Silhouette) -> float:
-    """Compute the share of the pixels at the border of a photograph that belong to the object, by the mask."""
+    """Compute which share of the pixels along the border of a photograph is inside the mask, 0 to 1."""
     mask = silhouette.mask > 127
     return float(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean())
 
 
 def mistake_in_masks(silhouettes: Sequence[Silhouette]) -> dict[str, Sequence[Silhouette]]:
-    """Find possible mistakes in the masks. Returns, by description of the mistake, the corrected silhouettes."""
+    """List mistakes that the user may have made in the masks.
+
+    Returns a dict from descriptions to corrected silhouettes.
+    """
     guesses: dict[str, Sequence[Silhouette]] = {}
     if np.median([border(silhouette) for silhouette in silhouettes]) > 0.5:  # an object is rarely all around
         guesses["masks are inverted: 255 is to be the object, 0 the background"] = [
@@ -111,9 +120,9 @@ def mistake_in_masks(silhouettes: Sequence[Silhouette]) -> dict[str, Sequence[Si
 
 
 def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
-    """Find a mistake in all masks or cameras that explains why the masks disagree.
+    """Find a mistake in the masks or cameras that explains why the masks disagree. It tries usual mistakes.
 
-    Returns its description for the user; None if no such mistake is found.
+    Returns a description for the user; None if no such mistake is found.
     """
     some = subsample(silhouettes, 32, 96)
     limit = max(CONFORMS, share_agreed(some) + 0.05)
@@ -134,7 +143,10 @@ def mistake(silhouettes: Sequence[Silhouette]) -> str | None:
 
 
 def half_pixel(hull: Hull) -> str | None:
-    """Test whether all principal points are wrong by half a pixel. Returns a sentence for the user; None if not."""
+    """Test whether all principal points are wrong by half a pixel.
+
+    Returns a sentence for the user; None if they are not.
+    """
     gaps, hull, some = dict[float, float](), copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
     silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
     for shift in (-0.5, 0.0, 0.5):

@@ -1,4 +1,4 @@
-"""Renders the same photographs with `photometric` and with Mitsuba's path tracer, for a comparison."""
+"""Renders the same photographs with mi_ring's `photometric` and with Mitsuba's path tracer, for a comparison."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +23,9 @@ LANES = 1 << 21  #: most rays in one launch
 
 @dataclass
 class Pictures:
-    """Pictures of one photograph by `photometric` and by `path`. Each field has 16 independent ones, (16, H, W, 3).
+    """Pictures of one photograph by `photometric` and by Mitsuba's `path`, as linear radiance.
 
-    All are linear radiance.
+    Each field has 16 independent renderings of it, (16, H, W, 3), whose spread is the Monte Carlo noise.
     """
 
     photometric: np.ndarray
@@ -35,10 +35,11 @@ class Pictures:
 
 
 def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
-    """Load a scene file for a comparison. Returns (scene, list of its `photograph` sensors).
+    """Load a scene file for a comparison of renderers. Returns (scene, list of its `photograph` sensors).
 
-    The scene has no tables, and Mitsuba's own integrators use the photographs' lights in it. Raises InputError if the
-    scene is not suitable, for example because a `shapenet` has no fitted object.
+    Tables and room light are removed from the scene. A `flash` emitter is added, with which Mitsuba's own integrators
+    use the photographs' lights. Raises InputError if the scene is not suitable, for example because a `shapenet` has no
+    fitted object.
     """
     scene, shots = open_scene(path)
     try:
@@ -53,9 +54,9 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
 
 
 def with_flash(scene: mi.Scene) -> mi.Scene:
-    """Return the scene with exactly one `flash` and no `room`, for Mitsuba's own integrators.
+    """Return the scene with exactly one `flash` emitter and without `room` emitters, for Mitsuba's own integrators.
 
-    The `flash` of a `shapenet` counts. Raises SceneError if the scene has several.
+    A `flash` that belongs to a `shapenet` counts. Raises SceneError if the scene has several.
     """
     count = sum(isinstance(emitter, flash.Flash) for emitter in scene.emitters())
     if count > 1:
@@ -71,10 +72,11 @@ def with_flash(scene: mi.Scene) -> mi.Scene:
 def render_both(
     scene: mi.Scene, photographs: Photographs, k: int, sensor: Any, scale: int, spp: int, depth: int, seed: int
 ) -> Pictures:
-    """Render photograph `k`, whose sensor is `sensor`, by `photometric` and by Mitsuba's `path`, 16 times each.
+    """Render photograph `k` by `photometric` and by Mitsuba's `path`, 16 times each.
 
-    `scale`: how many times smaller the pictures are. `spp`: samples per pixel. `depth`: largest length of the paths.
-    The seeds are between `seed` and `seed` + 31; both renderers have different ones. The film's filter is not used.
+    `sensor`: the sensor of the photograph. `scale`: divides width and height of the pictures. `spp`: samples per pixel.
+    `depth`: largest length of the light paths, Mitsuba's max_depth. Seeds are from `seed` to `seed` + 31; the two
+    renderers have different ones. The film's filter is not used.
     """
     size = sensor.camera.size
     width, height = (s // scale for s in size)
@@ -100,9 +102,10 @@ def render_both(
 def render_path(
     scene: mi.Scene, photographs: Photographs, sensor: Any, spp: int, seed: int, depth: int
 ) -> list[mi.Float]:
-    """Render a photograph by Mitsuba's `path`. Returns [R, G, B], Floats with one value per pixel.
+    """Render a photograph by Mitsuba's `path`. Returns [R, G, B], Dr.Jit arrays with one radiance per pixel.
 
-    `photographs`: the photograph of `sensor`, selected once or several times.
+    `photographs`: the photograph of `sensor`, once or several times; pictures follow one another. `depth`: largest
+    length of the light paths.
     """
     photograph.Photograph.current = sensor
     ray, _ = pixel_rays(photographs, spp, seed)

@@ -17,9 +17,10 @@ IMPLAUSIBLE = 0.75  #: share of interreflection above which the intensities are 
 
 @dataclass
 class Comparison:
-    """Differences between `photometric` and `path` in one photograph, or in all together.
+    """Differences between the renderers `photometric` and `path` in one photograph, or in all photographs together.
 
-    All numbers but `radiance`, `psnr` and the probabilities are shares of the mean radiance of `path`.
+    `radiance` is a radiance, `psnr` is in dB, `p_direct` and `p_path` are probabilities. All other numbers are shares
+    of the mean radiance of `path`.
     """
 
     name: str
@@ -37,14 +38,14 @@ class Comparison:
 
 
 def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
-    """Test the hypothesis that both renderers agree, by independent pictures a and b (16, H, W, 3) float64.
+    """Test the hypothesis that both renderers agree, by 16 independent pictures of each: a and b (16, H, W, 3) float64.
 
     Returns the p-value: the probability of so large a difference if they agree. It is the smaller one of two p-values,
     with Šidák's correction. The first one tests the mean of all pixels, by Student's t. The second one tests blocks of
     8 × 8 pixels. If the distributions are equal, each of the 16 differences d of a block is positive or negative with
-    equal probability, even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance
-    2 − 2 Σ d⁴ / (Σ d²)². Blocks are independent, so the sum over blocks has about a gamma distribution of known mean
-    and variance. Channels share samples, so each block uses one channel: red, green, blue in turn.
+    equal probability, even with heavy tails. Over all signs, (Σ d)² / Σ d² has mean 1 and variance 2 − 2 Σ d⁴ / (Σ
+    d²)². Blocks are independent, so the sum over blocks has about a gamma distribution of known mean and variance.
+    Channels share samples, so each block uses one channel: red, green, blue in turn.
     """
     whole, count = a.mean((1, 2, 3)) - b.mean((1, 2, 3)), len(a)
     error = np.hypot(whole.std(ddof=1) / np.sqrt(count), ROUNDING * (a.mean() + b.mean()))
@@ -63,9 +64,9 @@ def p_of_agreement(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def blocks(x: np.ndarray) -> np.ndarray:
-    """Sum pictures (16, H, W, 3) over blocks of 8 × 8 pixels. Returns (16, h, w), with one channel per block.
+    """Sum pictures (16, H, W, 3) over blocks of 8 × 8 pixels. Returns (16, h, w), with one colour channel per block.
 
-    Blocks at the border are smaller.
+    Neighbouring blocks use different channels: red, green, blue in turn. Blocks at the border are smaller.
     """
     _, height, width, _ = x.shape
     x = np.pad(x, ((0, 0), (0, -height % BLOCK), (0, -width % BLOCK), (0, 0)))
@@ -75,12 +76,12 @@ def blocks(x: np.ndarray) -> np.ndarray:
 
 
 def sidak(p: Sequence[float] | np.ndarray) -> float:
-    """Return the smallest one of several independent p-values, corrected for their number (Šidák 1967)."""
+    """Return the smallest of several independent p-values, corrected for their number (Šidák 1967)."""
     return float(-np.expm1(len(p) * np.log1p(-min(p)))) if min(p) < 1 else 1.0
 
 
 def compare_renderers(name: str, pictures: Pictures) -> Comparison:
-    """Compare the pictures of both renderers for the photograph `name`.
+    """Compare the pictures of both renderers for one photograph. `name`: its name.
 
     Raises InputError if pixels are NaN or infinite.
     """
@@ -106,7 +107,7 @@ def compare_renderers(name: str, pictures: Pictures) -> Comparison:
 
 
 def all_as_one(rows: list[Comparison]) -> Comparison:
-    """Combine the comparisons of all photographs to one.
+    """Combine the comparisons of all photographs to one, whose name is "all".
 
     Its shares are of the light in all photographs. Its p-values are corrected for the number of photographs.
     """
@@ -123,7 +124,7 @@ def all_as_one(rows: list[Comparison]) -> Comparison:
 
 
 def percent(x: float) -> str:
-    """Format a share as per cent."""
+    """Format a share, 0 to 1, as a percentage."""
     return f"{100 * x:.2f} %"
 
 
@@ -133,7 +134,7 @@ def probability(p: float) -> str:
 
 
 def comparison_table(rows: list[Comparison]) -> str:
-    """Format comparisons as a text table with one line each. Shares are in % of the mean radiance of `path`."""
+    """Format comparisons as a text table with one line each. Shares are in % of the path tracer's mean radiance."""
     cells: list[tuple[str, ...]] = [(
         "", "radiance", "difference %", "absolute %", "noise %", "PSNR", "shadows %", "interreflection %",
         "unexplained %", "p direct", "p path",
@@ -149,10 +150,10 @@ def comparison_table(rows: list[Comparison]) -> str:
 
 
 def verdict(rows: list[Comparison], everything: Comparison, significance: float) -> list[str]:
-    """Return three sentences for the user: whether the renderers agree, and how strong shadows and interreflection are.
+    """Return three sentences for the user: whether the renderers agree; how strong shadows are, and interreflection.
 
-    `rows`: comparisons of the photographs. `everything`: result of `all_as_one`. `significance`: p-value below which
-    the renderers disagree.
+    `rows`: comparisons of single photographs. `everything`: comparison of all photographs together. `significance`:
+    p-value below which the renderers disagree.
     """
     p = probability(everything.p_direct)
     if everything.p_direct >= significance:

@@ -1,4 +1,4 @@
-"""Compares two surfaces: normals, depths and silhouettes in photographs, and distances in space; aligns them."""
+"""Compares two surfaces: normals, depths and silhouettes in photographs, and distances in space. Also aligns them."""
 
 import sys
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ THRESHOLDS = 0.1, 0.5  #: of the F-score [% of the diagonal]
 
 
 def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
-    """Read a mesh file. Returns (mesh, scene with only this mesh and smooth normals).
+    """Read a mesh file. Returns (mesh, Mitsuba scene with only this mesh, with smooth normals).
 
     A mesh that is inside out is inverted, with a message on standard error. Raises InputError if the file cannot be
     read or has no triangles.
@@ -42,10 +42,10 @@ def load_true_mesh(path: Path) -> tuple[trimesh.Trimesh, mi.Scene]:
 
 
 def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) -> np.ndarray:
-    """Estimate the transform (4, 4) that aligns `mesh` with the nearby mesh `onto`. Moves neither mesh.
+    """Estimate the transform (4, 4) that aligns `mesh` with the mesh `onto`, which must be near. Moves neither mesh.
 
-    `similarity`: allow a scale; otherwise the transform is rigid. The method is point-to-plane ICP (Chen and Medioni,
-    1992). Far points have small weights, because parts of `onto` may be missing.
+    `similarity`: True allows a scale; False: the transform is rigid. The method is point-to-plane ICP (Chen and
+    Medioni, 1992). Far points have small weights, because parts of `onto` may be missing.
     """
     middle, unit = onto.bounds.mean(0), onto.scale
     normalise = trimesh.transformations.scale_and_translate(1 / unit, -middle / unit)
@@ -69,9 +69,10 @@ def alignment(mesh: trimesh.Trimesh, onto: trimesh.Trimesh, similarity: bool) ->
 
 
 def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Trace rays through the centres of the P pixels of a photograph.
+    """Trace a ray through the centre of each of the P pixels of a photograph.
 
-    Returns (hit (P,) bool, distance (P,), shading normal (P, 3), whether the ray hits the back of a face (P,) bool).
+    `photograph`: its camera, as the renderer takes it. Returns (whether the ray hits a surface (P,) bool, distance
+    (P,), shading normal (P, 3), whether it hits the back of a face (P,) bool).
     """
     # As `center_rays`, but times 1 / focal, as Dr.Jit computes it for constant cameras. Rays that differ in the last
     # bit change the fourth digit of mean errors, where pixels just graze the surface.
@@ -88,11 +89,13 @@ def hits(scene: mi.Scene, photograph: Photographs) -> tuple[np.ndarray, np.ndarr
 def compare_surfaces(
     capture: Capture, guess: mi.Scene, truth: mi.Scene, diagonal: float
 ) -> tuple[dict[str, float], list[dict]]:
-    """Compare two surfaces in all photographs. Returns (errors over all views by name, list of errors of each view).
+    """Compare two surfaces, `guess` and `truth`, in all photographs.
 
-    Errors are those of `error_means`, at pixels that see both surfaces, and `iou`, the intersection over union of the
-    silhouettes; over all views it is the mean. `flipped`: share of the pixels of `guess` that see the back of a face.
-    `diagonal`: unit of depth errors is 1 % of it. Raises InputError if no pixel sees both surfaces.
+    Returns (errors of all photographs together, list with errors of each), as dicts. They have mean and median of the
+    errors of normals [deg] and of depths [% of `diagonal`], at pixels that see both surfaces, and `iou`, the
+    intersection over union of the silhouettes. For all together, `flipped` is the share of the pixels of `guess` that
+    see the back of a face. `diagonal`: of the true bounding box [scene units]. Raises InputError if no pixel sees both
+    surfaces.
     """
     angles, depths, views, backs, pixels = [], [], [], 0, 0
     for k, name in enumerate(capture.names):
@@ -112,7 +115,10 @@ def compare_surfaces(
 
 
 def error_means(angle: np.ndarray, depth: np.ndarray) -> dict[str, float]:
-    """Compute mean and median of the errors (P,) of normals [deg] and of depths. Returns them by name; {} if P is 0."""
+    """Compute mean and median of the errors of normals, `angle` (P,) [deg], and of depths, `depth` (P,).
+
+    Returns a dict with `normal_mean`, `normal_median`, `depth_mean` and `depth_median`; {} if P is 0.
+    """
     return {
         "normal_mean": float(angle.mean()), "normal_median": float(np.median(angle)),
         "depth_mean": float(depth.mean()), "depth_median": float(np.median(depth)),
@@ -123,13 +129,14 @@ def compare_shapes(
     guess: trimesh.Trimesh, truth: trimesh.Trimesh, views: Sequence[MaskedCamera] | None = None,
     diagonal: float | None = None,
 ) -> dict[str, float]:  # fmt: skip
-    """Compare two surfaces in space. Returns numbers by name.
+    """Compare two surfaces in space. Returns a dict from names to numbers.
 
     The numbers use the exact distances of 100,000 random points of each surface to the other surface. `chamfer`: mean
     of the two mean distances [% of `diagonal`]. `f_score_t`: harmonic mean of precision and recall (Knapitsch et al.,
-    Tanks and Temples, ACM TOG 2017). Precision is the share of the points of `guess` with a distance of at most t % of
-    the diagonal; recall is the same for `truth`. `diagonal`: default: that of the bounding box of `truth`. `views`: if
-    they are given, only points that a view shows count, and `unseen` and `unseen_true` are the shares of the others.
+    Tanks and Temples, ACM TOG 2017). Precision is the share of the points of `guess` whose distance is at most t % of
+    the diagonal; recall is the same for `truth`. `diagonal`: None: that of the bounding box of `truth`. `views`: if
+    given, only points that a camera sees count; `unseen` and `unseen_true` are the shares of the others, on `guess` and
+    on `truth`.
     """
     diagonal, middle = diagonal or truth.scale, truth.bounds.mean(0)
     there, back = (100 / diagonal * distances(a, b, middle, views) for a, b in ((guess, truth), (truth, guess)))
@@ -145,10 +152,10 @@ def compare_shapes(
 def distances(
     start: trimesh.Trimesh, end: trimesh.Trimesh, middle: np.ndarray, views: Sequence[MaskedCamera] | None = None
 ) -> np.ndarray:
-    """Compute the distances (n,) of random points on `start` to the surface `end`.
+    """Compute the distances (n,) of random points on `start` to the surface `end`, in their unit of length.
 
-    `middle` (3,): a point near both surfaces, for precision. `views`: only points that a view shows are used; None:
-    all. Raises InputError if no view shows a point.
+    `middle` (3,): a point near both surfaces, for numerical precision. `views`: cameras; only points that one of them
+    sees are used; None: all. Raises InputError if no camera sees a point.
     """
     points, faces = trimesh.sample.sample_surface(start, POINTS, seed=0)
     if views is not None:

@@ -14,7 +14,7 @@ from mi_ring.nets.registry import register_network
 
 
 class Parameter(NamedTuple):
-    """A parameter of a BSDF that BRDF-Net predicts."""
+    """A parameter of a BSDF that BRDF-Net predicts: its name, channels (1 or 3), and range."""
 
     name: str
     channels: int  #: 1 or 3
@@ -46,9 +46,9 @@ class MaterialNet(nn.Module):
         self.set_parameters(parameters, scale)
 
     def set_parameters(self, parameters: Sequence[Parameter], scale: float) -> None:
-        """Set the BSDF parameters that the network predicts, and `scale`, the order of magnitude of the reflectances.
+        """Set the BSDF parameters that the network predicts. They must be in the order of the outputs of `evaluate`.
 
-        The parameters are in the order of the outputs of `evaluate`. A colour takes three outputs.
+        A colour takes three outputs. `scale`: order of magnitude of the reflectances, in the scene's unit of light.
         """
         self.bsdf_parameters = tuple(Parameter(*p) for p in parameters)
         self.scale.fill_(scale)
@@ -63,10 +63,11 @@ class MaterialNet(nn.Module):
         raise NotImplementedError
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
-        """Compute the parameters at domain points (..., 3). Returns tensors by name: (..., 3) for colours, else (...).
+        """Compute the parameters at domain points (..., 3).
 
-        A sigmoid maps the output of `evaluate` to the range of a parameter. If the range has no upper limit, softplus
-        times `scale` maps it, so that the outputs are about 1 in any unit of light.
+        Returns a dict by name: (..., 3) for colours, (...) for others. A sigmoid maps the output of `evaluate` to the
+        range of a parameter. If the range has no upper limit, softplus times `scale` is used, so that the network's
+        outputs are about 1 in any unit of light.
         """
         raw = self.evaluate(s).float().split([p.channels for p in self.bsdf_parameters], -1)
         result = {}
@@ -81,9 +82,10 @@ class MaterialNet(nn.Module):
 
 @register_network("brdfnet")
 class BRDFNet(MLP, MaterialNet):
-    """The paper's BRDF-Net, an MLP of 1,285 neurons: Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r), or the parameters of another BSDF.
+    """The paper's BRDF-Net, an MLP of 1,285 neurons: Ψ(s) = (ρʳ, ρᵍ, ρᵇ, ρᵞ, r): diffuse, specular, roughness.
 
-    The input is the point s of the domain, not the point of the deformed surface.
+    It can also predict the parameters of another BSDF. The input is the point s of the domain, not the point of the
+    deformed surface.
     """
 
     def __init__(
@@ -94,5 +96,8 @@ class BRDFNet(MLP, MaterialNet):
         self.set_parameters(parameters, scale)
 
     def arguments(self) -> dict:
-        """Return the arguments of the constructor by name, to save them. `scale` is saved with the weights instead."""
+        """Return the arguments of the constructor as a dict, to save them.
+
+        `scale` is not among them: it is a saved weight.
+        """
         return {"parameters": [tuple(p) for p in self.bsdf_parameters], **self.encoding.arguments()}

@@ -1,4 +1,4 @@
-"""Evaluates networks in chunks of points on all cores of the processor; each thread computes one chunk at a time."""
+"""Evaluates networks in chunks of points on all cores of the processor. Each thread computes one chunk at a time."""
 
 import os
 import threading
@@ -18,12 +18,11 @@ _lock = threading.Lock()
 
 
 def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Tensor:
-    """Compute the values of a network at points (n, 3), in chunks of equal size. Returns a tensor (n, …).
+    """Compute the values of a network at points `x` (n, 3), in chunks of equal size. Returns a tensor (n, …).
 
-    `ctx`: context of the autograd function; it receives the data for `backward_in_chunks`. `forward(chunk, keep)`
-    returns (values of the chunk; data for the backward pass if `keep`, else anything). `keep`: a backward pass will
-    follow. For more than `MAX_STORED` points the backward pass computes this data again, to save memory. On a GPU there
-    is a single chunk.
+    `ctx`: context of the autograd function; data for the backward pass are stored in it. `forward(chunk, keep)` returns
+    (values of the chunk, data for its backward pass). `keep`: True if a backward pass will follow. For more than
+    `MAX_STORED` points the backward pass computes these data again, to save memory. On a GPU there is a single chunk.
     """
     chunks = 1
     ctx.recompute = forward if keep and len(x) > MAX_STORED and x.device.type == "cpu" else None
@@ -39,12 +38,12 @@ def forward_in_chunks(ctx: Any, forward: Callable, x: Tensor, keep: bool) -> Ten
 
 
 def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Compute the gradients with respect to the points and to the parameters of `ctx.layers`.
+    """Compute the gradients with respect to the points and to the parameters of `ctx.layers`, in the same chunks.
 
-    Returns (gradient (n, 3) of the points, list of the gradients of the parameters). `ctx`: the context that was given
-    to `forward_in_chunks`. `gradient` (n, …): gradient of the values. `backward(gradient, stored, sums)` returns the
-    gradient of the points of one chunk and adds the gradients of the parameters to `sums`. Raises RuntimeError for a
-    second call, and if a parameter has changed since the forward pass.
+    `ctx`: context in which the forward pass has stored its data. `gradient` (n, …): gradient of the values.
+    `backward(gradient, stored, sums)` returns the gradient of the points of one chunk and adds the gradients of the
+    parameters to `sums`. Returns (gradient (n, 3) of the points, list of the gradients of the parameters). Raises
+    RuntimeError for a second call, and if a parameter has changed since the forward pass.
     """
     _ = ctx.saved_tensors  # lets torch check for changes: the layers may share memory with the parameters
     if ctx.stored is None:
@@ -64,9 +63,9 @@ def backward_in_chunks(ctx: Any, backward: Callable, gradient: Tensor) -> tuple[
 
 
 def in_parallel(function: Callable, *arguments: Sequence) -> list:
-    """Call `function` with the first items of all `arguments`, then with the second items, and so on, in threads.
+    """Call `function` once for each index i, with the items i of all `arguments`, in several threads.
 
-    Returns the list of results. In each worker thread, torch uses one thread.
+    Returns all results. The results are a list in the order of the items. In each thread, torch uses one core.
     """
     threads = min(torch.get_num_threads(), len(arguments[0]))
     if threads == 1:
@@ -75,7 +74,7 @@ def in_parallel(function: Callable, *arguments: Sequence) -> list:
 
 
 def pool(threads: int) -> ThreadPoolExecutor:
-    """Return this process's pool of worker threads. If it has fewer than `threads` threads, make a new pool."""
+    """Return the pool of worker threads of this process. If it has fewer than `threads` threads, a new pool is made."""
     global _pool
     with _lock:
         if _pool is None or _pool[0] != os.getpid() or _pool[1] < threads:  # a fork does not copy threads
@@ -95,6 +94,6 @@ def pool(threads: int) -> ThreadPoolExecutor:
 
 
 def use_one_thread() -> None:
-    """Make torch use one thread for all computations that the current thread starts."""
+    """Make torch use a single thread for all computations that the current thread starts."""
     torch.get_num_threads()  # the first call copies the number of the process, which would undo the next line
     torch.set_num_threads(1)

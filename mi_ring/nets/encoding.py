@@ -20,9 +20,9 @@ class PosEnc(nn.Module):
         self.width = 3 if spacing == "none" else 6 * frequencies
 
     def arguments(self) -> dict:
-        """Return {"encoding": `spacing`, "frequencies": `frequencies`}.
+        """Return the spacing and the number of frequencies as {"encoding": `spacing`, "frequencies": `frequencies`}.
 
-        These are the encoding's arguments in the constructors of Shape-Net and BRDF-Net.
+        Shape-Net and BRDF-Net have constructor arguments of these names.
         """
         return {"encoding": self.spacing, "frequencies": self.frequencies}
 
@@ -41,7 +41,8 @@ class PosEnc(nn.Module):
     def backward(self, features: Tensor, gradient: Tensor) -> Tensor:
         """Compute the gradient (n, 3) with respect to the points, in float32 or float64.
 
-        `features` (n, width): the result of `forward`. `gradient` (n, width): the gradient with respect to them.
+        `features` (n, width): the result of `forward` at the points. `gradient` (n, width): gradient with respect to
+        `features`.
         """
         dtype = torch.promote_types(features.dtype, torch.float32)
         if self.spacing == "none":

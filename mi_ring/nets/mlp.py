@@ -33,9 +33,10 @@ def plain_autograd() -> Iterator[None]:
 
 
 class MLP(nn.Module):
-    """A multilayer perceptron of points: encoding, `depth` hidden layers, and a linear layer with `outputs` outputs.
+    """A multilayer perceptron of points: positional encoding, `depth` hidden layers, and a linear layer.
 
-    The hidden layers have `width` neurons with leaky ReLU. Default of `encoding`: `PosEnc()`.
+    The hidden layers have `width` neurons with leaky ReLU. The last layer has `outputs` outputs. `encoding`: None
+    stands for the paper's positional encoding.
     """
 
     def __init__(self, depth: int, outputs: int, encoding: PosEnc | None = None, width: int = WIDTH) -> None:
@@ -48,8 +49,8 @@ class MLP(nn.Module):
     def evaluate(self, x: Tensor) -> Tensor:
         """Compute the outputs (..., outputs) at points (..., 3). Under `torch.autocast` they are bfloat16.
 
-        They allow one backward pass, for first derivatives. Within `plain_autograd` they allow several passes and
-        derivatives of any order.
+        One backward pass through the result is possible, for first derivatives. Within `plain_autograd`, several passes
+        and derivatives of any order are possible.
         """
         if _plain.get():
             x = self.encoding(x)
@@ -60,10 +61,10 @@ class MLP(nn.Module):
         return values.reshape(*x.shape[:-1], self.output.out_features)
 
     def operands(self, x: Tensor) -> list:
-        """List the arguments that `_Evaluate` and `_EulerSteps` both take last.
+        """List the arguments of the hand-written autograd functions that evaluate this network at points like `x`.
 
-        They are: the encoding; the number format of matrix products at points like `x`; whether gradients are needed;
-        weight and bias of each layer.
+        They are: the encoding; the number format of matrix products; whether gradients are needed; weight and bias of
+        each layer.
         """
         dtype = self.hidden[0](self.encoding(x.reshape(-1, 3)[:0])).dtype  # as autocast decides
         parameters = [p for layer in [*self.hidden, self.output] for p in (layer.weight, layer.bias)]
@@ -71,7 +72,7 @@ class MLP(nn.Module):
 
 
 class Layers:
-    """The layers of an MLP, for passes without PyTorch's autograd.
+    """The layers of an MLP, for forward and backward passes without PyTorch's autograd.
 
     `dtype`: number format of the matrix products. `parameters`: weight and bias of each layer; they are copied to this
     format.
@@ -84,8 +85,8 @@ class Layers:
     def forward(self, x: Tensor, keep: bool) -> tuple[list[Tensor], Tensor]:
         """Compute (activations, output (n, outputs)) at points (n, 3).
 
-        `keep`: return the activations of the encoding and of all hidden layers, for `backward`. Otherwise only those of
-        the last hidden layer are returned.
+        `keep`: True returns the activations of the encoding and of all hidden layers, which a backward pass needs.
+        False returns only those of the last hidden layer.
         """
         activations = [self.encoding(x).to(self.dtype)]
         for w, b in zip(self.weights[:-1], self.biases):
@@ -95,14 +96,15 @@ class Layers:
         return activations, F.linear(activations[-1], self.weights[-1], self.biases[-1])
 
     def zeros(self) -> list[Tensor]:
-        """Return a tensor of zeros for the gradient of each parameter, in float32 or float64."""
+        """Return a tensor of zeros in the shape of each parameter, in float32 or float64, to sum gradients in."""
         dtype = torch.promote_types(self.dtype, torch.float32)
         return [torch.zeros_like(p, dtype=dtype) for pair in zip(self.weights, self.biases) for p in pair]
 
     def backward(self, gradient: Tensor, activations: list[Tensor], sums: list[Tensor]) -> Tensor:
-        """Compute the gradient (n, 3) with respect to the points. Adds the gradients of the parameters to `sums`.
+        """Compute the gradient (n, 3) with respect to the points, and add the gradients of the parameters to `sums`.
 
-        `gradient` (n, outputs): gradient with respect to the output. `activations`: from `forward` with `keep`.
+        `gradient` (n, outputs): gradient with respect to the output. `activations`: those of all layers, as the method
+        `forward` returns them with `keep`. `sums`: one tensor for each parameter, changed in place.
         """
         gradient = gradient.to(self.dtype)
         for k in reversed(range(len(self.weights))):

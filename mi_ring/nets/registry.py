@@ -1,4 +1,4 @@
-"""Registers classes of networks by name: `ring.pt` stores these names instead of pickled classes."""
+"""Registers classes of networks by name. The file `ring.pt` stores these names instead of pickled classes."""
 
 from collections.abc import Callable
 from importlib.metadata import entry_points
@@ -14,12 +14,12 @@ _networks: dict[str, type[nn.Module]] = {}
 
 
 def register_network(name: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
-    """Return a decorator that registers a class of networks under `name`. `ring.pt` stores this name.
+    """Return a decorator that registers a class of networks under `name`. The file `ring.pt` stores this name.
 
-    The class may have a method `arguments`. It returns the arguments of the constructor as a dictionary of plain data,
-    which `ring.pt` stores together with the weights (`state_dict`). Another package may offer a network as an entry
-    point of the group `mi_ring.networks`; then the user need not import the package. The decorator raises ValueError if
-    another class has this name.
+    The class may have a method `arguments`. It returns the arguments of the constructor as a dict of plain data, which
+    `ring.pt` stores together with the weights (`state_dict`). Another package may offer a network as an entry point of
+    the group `mi_ring.networks`; the user then need not import the package. The decorator raises ValueError if another
+    class has this name.
     """
 
     def register(network: type[nn.Module]) -> type[nn.Module]:
@@ -38,7 +38,7 @@ def qualified_name(network: type) -> tuple[str, str]:
 
 
 def architecture_of(network: nn.Module) -> dict:
-    """Describe a network for `build`: {"name": its registered name, "arguments": those of its constructor}.
+    """Describe a network as plain data: a dict with its registered "name" and its constructor's "arguments", a dict.
 
     Raises ValueError if the class of the network is not registered.
     """
@@ -51,9 +51,9 @@ def architecture_of(network: nn.Module) -> dict:
 
 
 def build(architecture: dict) -> Any:
-    """Make a network with random weights. `architecture`: from `architecture_of`.
+    """Make a network with random weights from its description, {"name": registered name, "arguments": dict}.
 
-    Raises InputError if the name in it is not registered.
+    The arguments are those of the constructor. Raises InputError if the name is not registered.
     """
     name = architecture["name"]
     for entry in entry_points(group=GROUP, name=name) if name not in _networks else ():

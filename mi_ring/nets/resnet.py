@@ -14,7 +14,7 @@ from mi_ring.nets.shape_net import Flow, ShapeNet, Velocity, VelocityField
 class ResNet(Flow):
     """A plain ResNet of T = `steps` blocks `x ← x + Vₖ(x) / T`. Each block k has its own weights.
 
-    `width`: neurons per layer of each block. Default: so many that all blocks together have as many parameters as
+    `width`: neurons per layer of each block. None: so many that all blocks together have as many parameters as
     Shape-Net; this is about 42 for T = 20. With 256, the width of Shape-Net, the ResNet has T times as many parameters.
     """
 
@@ -28,11 +28,11 @@ class ResNet(Flow):
         self.blocks = nn.ModuleList(VelocityField(self.encoding, w) for w in widths)
 
     def arguments(self) -> dict:
-        """Return the arguments of the constructor by name, to save them."""
+        """Return the arguments of the constructor as a dict, to save them."""
         return {"steps": self.steps, "width": self.width, **self.encoding.arguments()}
 
     def velocity_of(self, step: int) -> Velocity:
-        """Return the velocity field Vₖ of block k = `step`."""
+        """Return the velocity field Vₖ of block k = `step`, counted from 0: a function of points (..., 3)."""
         block: Any = self.blocks[step]
         return block.velocity
 
@@ -40,7 +40,8 @@ class ResNet(Flow):
 def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
     """Choose the widths of `blocks` blocks that together have about as many parameters as one block of width `WIDTH`.
 
-    Returns a list of widths. The first blocks are one neuron wider than the others where this reduces the difference.
+    Returns a list of widths [neurons per layer]. The first blocks are one neuron wider than the others where this makes
+    the number of parameters more equal.
     """
 
     def parameters(width: int) -> int:
@@ -54,10 +55,11 @@ def equal_widths(blocks: int, encoding: PosEnc) -> list[int]:
 
 
 def shape_net_of(kind: str, steps: int, encoding: str, frequencies: int) -> Flow:
-    """Make the network that deforms the domain. `kind`: a value of `Config.shape_net`.
+    """Make the network that deforms the domain, with random weights. `kind`: "ring", "resnet" or "wide-resnet".
 
     "ring" is Shape-Net. "resnet" is a plain ResNet with as many parameters. "wide-resnet" is a plain ResNet as wide as
-    Shape-Net.
+    Shape-Net. `steps`: Euler steps or blocks. `encoding`, `frequencies`: spacing and number of the frequencies of the
+    positional encoding.
     """
     if kind == "ring":
         return ShapeNet(steps, encoding, frequencies)

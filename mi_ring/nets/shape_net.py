@@ -28,31 +28,34 @@ class Flow(nn.Module):
     steps: int = 20  #: T: steps from the domain to the object
 
     def velocity(self, x: Tensor) -> Tensor:
-        """Compute V(x) at points (..., 3); of the same shape and type as x."""
+        """Compute the velocity V(x) at points (..., 3). The result has the shape and type of x."""
         raise NotImplementedError
 
     def velocity_of(self, step: int) -> Velocity:
-        """Return the velocity field V of Euler step number `step`, counted from 0.
+        """Return the velocity field V of Euler step number `step`, counted from 0: a function of points (..., 3).
 
         A plain ResNet has another field for each step. All other networks have one field.
         """
         return self.velocity
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """Compute Φ(x, steps / T) for points (V, 3), by the first `steps` of the T Euler steps `x ← x + V(x) / T`."""
+        """Compute Φ(x, `steps` / T) for points (V, 3), by the first `steps` of the T Euler steps `x ← x + V(x) / T`."""
         for step in range(steps):
             x = x + 1 / self.steps * self.velocity_of(step)(x)
         return x
 
     def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
-        """Compute Φ(x, time) for points (V, 3) and a `time` in [0, 1]. Between two steps, the last one is shorter."""
+        """Compute Φ(x, time) for points (V, 3) and a `time` in [0, 1].
+
+        If `time` is not a multiple of 1 / T, the last step is short.
+        """
         steps = int(time * self.steps)
         x, rest = self.flow(x, steps) if steps else x, time - steps / self.steps
         return x + rest * self.velocity_of(steps)(x) if rest else x
 
 
 class VelocityField(MLP):
-    """The velocity field V: an MLP. In the paper it has 771 neurons.
+    """The velocity field V: an MLP with positional encoding. In the paper it has 771 neurons.
 
     A tanh limits each component to `SPEED`, as in the authors' "Diffeomorphic Neural Surface Parameterization",
     SIGGRAPH 2022. The initial velocity is almost 0, so that the fit starts from the domain.
@@ -65,7 +68,7 @@ class VelocityField(MLP):
             self.output.bias.zero_()
 
     def velocity(self, x: Tensor) -> Tensor:
-        """Compute V(x) at points (..., 3); of the same shape and type as x."""
+        """Compute the velocity V(x) at points (..., 3). The result has the shape and type of x."""
         return SPEED * torch.tanh(self.evaluate(x).to(x.dtype))
 
 
@@ -78,14 +81,15 @@ class ShapeNet(VelocityField, Flow):
         self.steps = steps
 
     def arguments(self) -> dict:
-        """Return the arguments of the constructor by name, to save them."""
+        """Return the arguments of the constructor as a dict, to save them."""
         return {"steps": self.steps, **self.encoding.arguments()}
 
     def flow(self, x: Tensor, steps: int) -> Tensor:
-        """Compute the same as `Flow.flow`, faster. Under `torch.autocast`, matrix products are in bfloat16.
+        """Compute Φ(x, `steps` / T) for points (V, 3), by the first `steps` of the T Euler steps.
 
-        The result allows one backward pass, for first derivatives. Within `plain_autograd` it allows several passes and
-        derivatives of any order.
+        The derivatives are hand-written. Under `torch.autocast`, matrix products are in bfloat16. One backward pass
+        through the result is possible, for first derivatives. Within `plain_autograd`, several passes and derivatives
+        of any order are possible.
         """
         if _plain.get():
             return super().flow(x, steps)

@@ -28,8 +28,8 @@ class FittedObject(nn.Module):
     `center` (3,), `radius`: normalising sphere [scene units]. `domain`: the start surface; default: the unit sphere.
     `parameters`: the BSDF parameters that Ψ predicts. `bsdf`: Mitsuba's XML of the BSDF that reads them. `indirect`:
     the fit and its pictures include interreflection. `subdivisions`: level of the mesh in the results; finer levels are
-    less certain. `networks`: (Shape-Net Φ, BRDF-Net Ψ). Without them, the networks of the paper are made from `steps`,
-    `scale` and `parameters`; see `mi_ring.nets.shape_net.Flow` and `mi_ring.nets.brdf_net.MaterialNet`.
+    less certain. `networks`: (Shape-Net Φ, BRDF-Net Ψ). Without them, the networks of the paper are made: `steps` is
+    the number of Euler steps of the flow Φ, `scale` the order of magnitude of the reflectances.
 
     `ground` (2, 3): a point of the table below the object and the table's unit normal. Surface points below the table
     are moved up to the table. `up` (3,), the up direction, and `metres`, the length of a scene unit [m], are for
@@ -62,27 +62,34 @@ class FittedObject(nn.Module):
     def surface(self, s: Tensor, time: float = 1.0) -> Tensor:
         """Compute the surface points (V, 3) [scene units] of the domain points `s` (V, 3).
 
-        `time`: of the deformation. 0: the domain. 1: the finished object.
+        `time`: state of the deformation. 0: the domain. 1: the finished object.
         """
         return self.to_scene(self.shape_net(s, time))
 
     def material(self, s: Tensor) -> dict[str, Tensor]:
-        """Compute the BSDF parameters at the domain points `s` (V, 3). Returns tensors (V, 3) or (V,) by name."""
+        """Compute the BSDF parameters at the domain points `s` (V, 3).
+
+        Returns a dict from names to tensors (V, 3) or (V,).
+        """
         return self.brdf_net(s)
 
     def forward(self, s: Tensor, time: float = 1.0) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return (`surface`, `material`) at the domain points `s` (V, 3)."""
+        """Compute surface and material at the domain points `s` (V, 3).
+
+        Returns (points (V, 3) [scene units], dict from names of BSDF parameters to tensors (V, 3) or (V,)). `time`:
+        state of the deformation. 0: the domain. 1: the finished object.
+        """
         return self.surface(s, time), self.material(s)
 
     def render(
         self, camera: Camera, light: Light | None = None, spp: int = 16, level: int | None = None, shadows: bool = True,
         seed: int = 0,
     ) -> Tensor:  # fmt: skip
-        """Render a picture (H, W, 3) of linear radiance under direct light. The camera gives its size.
+        """Render a picture (H, W, 3) of linear radiance under direct light. `camera` determines H and W.
 
-        `light`: default: a point light of intensity 1 at the camera. `spp`: samples per pixel. `level`: level of the
-        mesh; default: `subdivisions`. `shadows`: the object casts shadows on itself. The picture allows one backward
-        pass to the parameters of both networks. Its gradients include moving outlines and shadows.
+        `light`: None: a point light of intensity 1 at the camera. `spp`: samples per pixel. `level`: level of the mesh;
+        None: the object's `subdivisions`. `shadows`: the object casts shadows on itself. One backward pass from the
+        picture to the parameters of both networks is possible. Its gradients include moving outlines and shadows.
 
         Raises InputError if camera or light is invalid, and for numbers out of range.
         """

@@ -35,7 +35,7 @@ class MaterialOptions:
 
 
 def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
-    """Change the material of `ring` in place, as the options say.
+    """Change the material of `ring` in place. `options`: factors and offsets, or another fit whose material it gets.
 
     Raises InputError if an option is out of range, or if the material lacks the parameter that an option changes.
     """
@@ -68,9 +68,9 @@ def edit_material(ring: FittedObject, options: MaterialOptions) -> None:
 
 
 def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> list[str]:
-    """List the parameters of the object's material whose name is among `names`.
+    """List those of `names` that are parameters of the object's material.
 
-    Raises InputError, which begins with the `option`, if there is no such parameter.
+    Raises InputError if there is none. The message begins with `option`, the option that changes them.
     """
     parameters = [p.name for p in ring.brdf_net.bsdf_parameters]
     found = [name for name in parameters if name in names]
@@ -80,9 +80,10 @@ def parameters_among(ring: FittedObject, option: str, names: Sequence[str]) -> l
 
 
 class TransferredMaterial(MaterialNet):
-    """Evaluates the BRDF-Net `net` of the domain `there` at points of another domain, `here`.
+    """The material of another fit, evaluated at points of this object's domain.
 
-    The maps of both domains to the unit sphere give corresponding points.
+    `net`: BRDF-Net of the other fit. `here`, `there`: maps of this domain and of the other fit's domain to the unit
+    sphere. Points of both domains correspond to each other if they are mapped to one point of the sphere.
     """
 
     def __init__(self, net: MaterialNet, here: SphericalMap, there: SphericalMap) -> None:
@@ -95,9 +96,9 @@ class TransferredMaterial(MaterialNet):
 
 
 class EditedMaterial(MaterialNet):
-    """Evaluates the BRDF-Net `net`, and multiplies each parameter by its gain and adds its offset.
+    """The material of the BRDF-Net `net`, in which each parameter is multiplied by its gain, and its offset is added.
 
-    `gains`, `offsets`: by name of the parameter. Results are clipped to the ranges of the parameters.
+    `gains`, `offsets`: dicts from names of parameters to numbers. Results are clipped to the ranges of the parameters.
     """
 
     def __init__(self, net: MaterialNet, gains: dict, offsets: dict) -> None:

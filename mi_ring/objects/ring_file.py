@@ -1,4 +1,4 @@
-"""Reads and makes the content of `ring.pt`, the file of a fitted object. It stores networks by registered names."""
+"""Reads and makes the content of `ring.pt`, the file of a fitted object. It stores the registered names of networks."""
 
 import io
 import math
@@ -23,9 +23,9 @@ ADVICE = "give the results folder of a fit, or its ring.pt"
 
 
 def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
-    """Make the content of `ring.pt` as a dictionary, for `write_state`. Writes no file. `config`: settings of the fit.
+    """Make the content of `ring.pt`, a dict, from a fitted object. Writes no file.
 
-    Raises ValueError if a network is not registered.
+    `config`: settings of the fit, if known. Raises ValueError if a network is not registered.
     """
     domain = None
     if not isinstance(ring.domain, Sphere):  # as tensors: torch loads no numpy arrays with `weights_only`
@@ -39,7 +39,7 @@ def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
 
 
 def ring_of(state: dict) -> FittedObject:
-    """Make a fitted object from the content of `ring.pt`, a dictionary from `ring_state`.
+    """Make a fitted object from the content of `ring.pt`, a dict.
 
     Raises InputError if a network is not registered, and for settings of older versions that were removed. Raises
     KeyError, RuntimeError, TypeError or ValueError if the state is damaged.
@@ -99,7 +99,10 @@ def require(condition: bool, otherwise: str) -> None:
 
 
 def upgraded(state: dict) -> dict:
-    """Convert a state of format 3, which mi_ring 0.1 wrote, to the present format. Returns a new dictionary."""
+    """Convert the content of a `ring.pt` of format 3, which mi_ring 0.1 wrote, to the present format.
+
+    Returns a new dict.
+    """
     return state | {
         "format": FORMAT, "shape_net": {"name": "shapenet", "arguments": {"steps": state["steps"]}},
         "brdf_net": {"name": "brdfnet", "arguments": {"parameters": state["parameters"]}},
@@ -108,11 +111,11 @@ def upgraded(state: dict) -> dict:
 
 
 def read_state(path: Path, kind: str, advice: str) -> dict:
-    """Read a file that `write_state` wrote. Returns its content, a dictionary.
+    """Read a file that mi_ring has written, such as ring.pt or a checkpoint. Returns its content, a dict.
 
-    `kind`, `advice`: for messages: what the file should be, and what the user can do. Raises InputError if the file is
-    missing, damaged or of another kind. Damage is found by the checksum of the file. Files of mi_ring 0.1 have only the
-    checksums of the zip format.
+    `kind`, `advice`: texts for messages: what the file should be, and what the user can do. Raises InputError if the
+    file is missing, damaged or of another kind. Damage is found by the checksum of the file. Files of mi_ring 0.1 have
+    only the checksums of the zip format.
     """
     try:
         content = path.read_bytes()
