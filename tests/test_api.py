@@ -265,7 +265,7 @@ def test_a_fit_goes_on_from_its_state(capture):
     rest = [it.loss for it in first]
     again = mi_ring.Fit(capture, config(), state=state)
     assert again.iteration == 2 and [it.loss for it in again] == pytest.approx(rest, rel=1e-4)
-    for settings, found in ((config(optimizer="adam"), state), (config(), {"ring": 1}), (config(), {}), (config(), "a.pt")):
+    for settings, found in ((config(optimizer="adam"), state), *((config(), no) for no in ({"ring": 1}, {}, "a.pt"))):
         with pytest.raises(mi_ring.InputError, match="state: is of a fit with other settings, networks or photographs"):
             mi_ring.Fit(capture, settings, state=found)
     with pytest.raises(mi_ring.InputError, match="state: is of a fit with other settings, networks or photographs"):

@@ -288,6 +288,45 @@ def test_a_command_whose_reader_has_gone_says_nothing():
     assert (done.returncode, done.stderr) == (141, b"")
 
 
+def test_help_whose_reader_has_gone_says_nothing(monkeypatch, capsys):
+    def helped(_):
+        print("help")
+        sys.exit(0)
+
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        with pytest.raises(SystemExit) as stop:
+            command.run("mi_ring.fit", helped, [])
+    assert stop.value.code == 141 and capsys.readouterr().err == ""
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="only Linux has it")
+def test_output_to_a_full_disk_is_one_line(monkeypatch, capsys):
+    with open("/dev/full", "w") as full:  # whose end would fail again
+        monkeypatch.setattr(sys, "stdout", full)
+        with pytest.raises(SystemExit) as stop:
+            command.run("mi_ring.check", lambda _: print("table"), [])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == f"mi_ring.check: standard output, or a file: {os.strerror(errno.ENOSPC)}\n"
+
+
+def test_a_command_without_streams_works(monkeypatch):
+    """As after `<&- >&- 2>&-`, where Python has none."""
+
+    def talks(_):
+        print("table")
+        print("found", file=sys.stderr)
+        assert sys.stdin.read() == ""
+
+    for name in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    with pytest.raises(SystemExit) as stop:
+        command.run("mi_ring.check", talks, [])
+    assert stop.value.code == 0
+
+
 def test_an_exr_is_written_and_read_on_a_single_thread(tmp_path):
     """In a process of its own: Mitsuba would wait forever."""
     script = f"""

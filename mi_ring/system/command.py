@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import difflib
+import errno
 import io
 import itertools
 import math
@@ -25,6 +26,7 @@ from mi_ring.system import llvm
 MAX_MESSAGE = 800  #: characters of an error message
 #: Signals that end a command: Ctrl-C; `kill` and schedulers; a terminal that closes (not on Windows).
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  #: of a full disk, a quota, and `ulimit -f`
 REPEATED = 5.0  #: a second SIGTERM or SIGHUP within this time is a copy of the first [s]
 
 
@@ -197,19 +199,37 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     traceback = "--traceback" in arguments
     arguments = [argument for argument in arguments if argument != "--traceback"]
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed, as by `>&-`: a file of ours must not take its place
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
     try:
-        status = main(arguments) or 0
+        try:
+            status: Any = main(arguments) or 0
+        except SystemExit as stop:  # after --help
+            status = stop.code
         sys.stdout.flush()  # so that a broken pipe is noticed here
         sys.exit(status)
     except KeyboardInterrupt as stop:
         sys.exit(exit_status(stop))
     except BrokenPipeError:  # `mi-ring … | head` has stopped reading
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        finish_output()
         sys.exit(141)
     except (InputError, OSError) as error:
-        # An OSError with a file name is a user error: no permission, a removed folder. Others are bugs.
-        if traceback or (isinstance(error, OSError) and not (error.filename and error.strerror)):
+        # An OSError with a file name is a user error: no permission, a removed folder. So is a full disk. Others are
+        # bugs.
+        full = isinstance(error, OSError) and error.errno in FULL
+        if traceback or (isinstance(error, OSError) and not (full or (error.filename and error.strerror))):
             raise
-        message = str(error) if isinstance(error, InputError) else f"{error.filename}: {error.strerror}"
+        finish_output()
+        place = getattr(error, "filename", None) or "standard output, or a file"
+        message = str(error) if isinstance(error, InputError) else f"{place}: {error.strerror}"
         print(f"{program}: {one_line(message)}", file=sys.stderr)
         sys.exit(2)
+
+
+def finish_output() -> None:
+    """Write the buffered standard output. If that fails, drop it; otherwise, it would fail again at exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
