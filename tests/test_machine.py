@@ -1,6 +1,7 @@
 """The machine that all runs on: cores, threads, files, and how a command ends."""
 
 import errno
+import functools
 import io
 import os
 import signal
@@ -14,6 +15,7 @@ import pytest
 import torch
 from helpers.quick_fits import SPHERE
 
+from mi_ring.doctor import DoctorConfig
 from mi_ring.errors import InputError
 from mi_ring.fitting import session
 from mi_ring.nets import chunks
@@ -275,6 +277,49 @@ def test_a_signal_of_which_a_library_makes_an_error_of_its_own_is_one(number, ca
     with pytest.raises(InputError, match="no signal"), command.resumable():
         raise InputError("no signal")
     assert not command.interrupted()
+
+
+def test_a_ctrl_c_of_which_a_library_makes_an_error_ends_a_command_without_a_word(capsys, monkeypatch, heard_signals):
+    def main(_):
+        command.parse(DoctorConfig, [], "mi_ring.doctor", needs_llvm=False)
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("a plugin cannot be made") from error
+
+    monkeypatch.setattr(command, "_received", [])
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # as a command begins
+    with pytest.raises(SystemExit) as stop:
+        command.run("mi_ring.doctor", main, [])
+    assert stop.value.code == 128 + signal.SIGINT and capsys.readouterr().err == ""
+
+
+#: Sends Ctrl-C when a package is about to be imported.
+EARLY = """
+import os, signal, sys
+
+class Impatient:
+    def find_spec(self, name, path=None, target=None):
+        if name == os.environ["IMPATIENT"]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Impatient())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has other signals")
+@pytest.mark.parametrize("package", ["mitsuba", "scipy.stats"])
+def test_ctrl_c_at_the_start_ends_a_command_without_a_word(package, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(EARLY)
+    environment = os.environ | {
+        "IMPATIENT": package,
+        "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[1]}",
+    }
+    listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # who starts the tests may ignore it
+    for call in (["mi_ring.fit"], ["mi_ring", "fit"]):
+        words = [sys.executable, "-m", *call, "scene.xml"]
+        done = subprocess.run(words, capture_output=True, env=environment, preexec_fn=listening)
+        assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, b"", b"")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="has no SIGPIPE")

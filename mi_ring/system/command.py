@@ -40,6 +40,8 @@ def parse(
     the docstring of the dataclass. Raises InputError for wrong arguments. With `needs_llvm`, it also raises InputError
     if there is no LLVM, but not for the help.
     """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # set by the import of mi_ring
+        signal.signal(signal.SIGINT, receive)  # from here on, there may be partial files to remove
     for word in (*arguments, os.getcwd()):
         require_utf8(word)
     words, box = ["--help" if word == "--help-all" else word for word in arguments], io.StringIO()
@@ -140,11 +142,20 @@ def exit_status(stop: KeyboardInterrupt) -> int:
     return 128 + (stop.args[0] if isinstance(stop, Interrupted) else signal.SIGINT)
 
 
-_received: list[tuple[int, float]] = []  #: signals within `resumable`: number, time of arrival [s]
+_received: list[tuple[int, float]] = []  #: signals that `receive` has handled: number, time of arrival [s]
+
+
+def receive(number: int, frame: object) -> None:
+    """Handle a signal: raise Interrupted, and record the signal."""
+    before, now = _received[-1][1] if _received else -math.inf, time.monotonic()
+    _received.append((number, now))
+    # Shells, schedulers and the kernel may send a signal several times. Each Ctrl-C is meant.
+    if number == signal.SIGINT or now - before > REPEATED:
+        raise Interrupted(number)
 
 
 def interrupted() -> bool:
-    """Return whether a signal has arrived within `resumable`. Native code may have turned it into another error."""
+    """Return whether `receive` has handled a signal. Native code may have turned it into another error."""
     return bool(_received)
 
 
@@ -155,13 +166,6 @@ def resumable() -> Iterator[None]:
     It then raises Interrupted, even if a library turns the signal into another error. Only the main thread receives
     signals.
     """
-
-    def receive(number: int, frame: object) -> None:
-        before, now = _received[-1][1] if _received else -math.inf, time.monotonic()
-        _received.append((number, now))
-        # Shells, schedulers and the kernel may send a signal several times. Each Ctrl-C is meant.
-        if number == signal.SIGINT or now - before > REPEATED:
-            raise Interrupted(number)
 
     handled = []
     if threading.current_thread() is threading.main_thread():
@@ -214,15 +218,18 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
     except BrokenPipeError:  # `mi-ring … | head` has stopped reading
         finish_output()
         sys.exit(141)
-    except (InputError, OSError) as error:
-        # An OSError with a file name is a user error: no permission, a removed folder. So is a full disk. Others are
-        # bugs.
-        full = isinstance(error, OSError) and error.errno in FULL
-        if traceback or (isinstance(error, OSError) and not (full or (error.filename and error.strerror))):
+    except Exception as error:
+        if _received:  # Mitsuba and others make errors of their own of a Ctrl-C
+            sys.exit(128 + _received[0][0])
+        message = str(error)
+        if isinstance(error, OSError) and error.strerror and (error.filename or error.errno in FULL):
+            # A user error: no permission, a removed folder, a full disk. Other OSErrors are bugs.
+            message = f"{error.filename or 'standard output, or a file'}: {error.strerror}"
+        elif not isinstance(error, InputError):
+            raise
+        if traceback:
             raise
         finish_output()
-        place = getattr(error, "filename", None) or "standard output, or a file"
-        message = str(error) if isinstance(error, InputError) else f"{place}: {error.strerror}"
         print(f"{program}: {one_line(message)}", file=sys.stderr)
         sys.exit(2)
 
