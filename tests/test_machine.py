@@ -310,9 +310,7 @@ sys.meta_path.insert(0, Impatient())
 @pytest.mark.skipif(os.name != "posix", reason="Windows has other signals")
 def test_ctrl_c_at_the_start_ends_a_command_without_a_word(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(EARLY)
-    environment = os.environ | {
-        "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[1]}",
-    }
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[1]}"}
     listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # who starts the tests may ignore it
     for call in (["mi_ring.fit"], ["mi_ring", "fit"]):
         words = [sys.executable, "-m", *call, "scene.xml"]
