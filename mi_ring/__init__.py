@@ -16,6 +16,7 @@ The package imports each name of the Python API at its first use:
 import importlib
 import os
 import re
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -91,12 +92,17 @@ def _command_looked_for() -> str | None:
 
 def _prepare_mitsuba() -> None:
     """Choose LLVM, register the plugins, select a variant."""
+    program = Path("".join(sys.argv[:1])).stem == "mi-ring" or (sys.argv[:1] == ["-m"] and "mi_ring" in sys.orig_argv)
+    command = _command_looked_for()
+    if (command or program) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        # Until a command reads its arguments: packages that it imports turn a KeyboardInterrupt into other errors, or
+        # drop it.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     # Otherwise torch's idle workers spin and take the cores from Dr.Jit. Torch reads this when it is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     choose_gpu()
     llvm.prepare()
     problem = llvm.missing()
-    command = _command_looked_for()
     if llvm.has_atomic():  # else Mitsuba cannot be imported
         import drjit as dr
         import mitsuba as mi
@@ -118,7 +124,7 @@ def _prepare_mitsuba() -> None:
     elif command and command != "mi_ring.doctor":  # its module cannot be imported
         print(f"{command}: {problem}", file=sys.stderr)
         sys.exit(2)
-    if problem and not command and Path(sys.argv[0]).stem != "mi-ring":  # commands print it themselves
+    if problem and not command and not program:  # commands print it themselves
         warnings.warn(problem, stacklevel=3)
 
 

@@ -265,7 +265,7 @@ def test_a_fit_goes_on_from_its_state(capture):
     rest = [it.loss for it in first]
     again = mi_ring.Fit(capture, config(), state=state)
     assert again.iteration == 2 and [it.loss for it in again] == pytest.approx(rest, rel=1e-4)
-    for settings, found in ((config(optimizer="adam"), state), (config(), {"ring": 1}), (config(), "state.pt")):
+    for settings, found in ((config(optimizer="adam"), state), *((config(), no) for no in ({"ring": 1}, {}, "a.pt"))):
         with pytest.raises(mi_ring.InputError, match="state: is of a fit with other settings, networks or photographs"):
             mi_ring.Fit(capture, settings, state=found)
     with pytest.raises(mi_ring.InputError, match="state: is of a fit with other settings, networks or photographs"):
@@ -302,6 +302,10 @@ def test_what_is_no_part_of_a_fit_is_refused_by_name(capture):
         ({"networks": (mi_ring.ShapeNet(3),)}, "networks: must be two instances"),
         ({"networks": mi_ring.ShapeNet(3)}, "networks: must be two instances"),
         ({"networks": (mi_ring.ShapeNet, mi_ring.BRDFNet)}, "networks: must be two instances"),
+        ({"config": {}}, "config: is dict, must be a mi_ring.Config"),
+        ({"lighting": "environment"}, r"lighting: is 'environment'; give Fit what mi_ring.choose_lighting\("),
+        ({"lighting": mi_ring.Lighting("auto")}, r"lighting: is Lighting\(kind='auto', .*choose_lighting\("),
+        ({"lighting": mi_ring.Lighting("lamps")}, r"lighting: is Lighting\(kind='lamps', .*choose_lighting\("),
     ):
         with pytest.raises(mi_ring.InputError, match=words):
             mi_ring.Fit(**{"capture": capture, "config": config()} | arguments)

@@ -1,6 +1,7 @@
 """The machine that all runs on: cores, threads, files, and how a command ends."""
 
 import errno
+import functools
 import io
 import os
 import signal
@@ -14,6 +15,7 @@ import pytest
 import torch
 from helpers.quick_fits import SPHERE
 
+from mi_ring.doctor import DoctorConfig
 from mi_ring.errors import InputError
 from mi_ring.fitting import session
 from mi_ring.nets import chunks
@@ -277,6 +279,45 @@ def test_a_signal_of_which_a_library_makes_an_error_of_its_own_is_one(number, ca
     assert not command.interrupted()
 
 
+def test_a_ctrl_c_of_which_a_library_makes_an_error_ends_a_command_without_a_word(capsys, monkeypatch, heard_signals):
+    def main(_):
+        command.parse(DoctorConfig, [], "mi_ring.doctor", needs_llvm=False)
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("a plugin cannot be made") from error
+
+    monkeypatch.setattr(command, "_received", [])
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # as a command begins
+    with pytest.raises(SystemExit) as stop:
+        command.run("mi_ring.doctor", main, [])
+    assert stop.value.code == 128 + signal.SIGINT and capsys.readouterr().err == ""
+
+
+#: Sends Ctrl-C when Mitsuba is about to be imported.
+EARLY = """
+import os, signal, sys
+
+class Impatient:
+    def find_spec(self, name, path=None, target=None):
+        if name == "mitsuba":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Impatient())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has other signals")
+def test_ctrl_c_at_the_start_ends_a_command_without_a_word(tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(EARLY)
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[1]}"}
+    listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # who starts the tests may ignore it
+    for call in (["mi_ring.fit"], ["mi_ring", "fit"]):
+        words = [sys.executable, "-m", *call, "scene.xml"]
+        done = subprocess.run(words, capture_output=True, env=environment, preexec_fn=listening)
+        assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, b"", b"")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="has no SIGPIPE")
 def test_a_command_whose_reader_has_gone_says_nothing():
     reading, writing = os.pipe()
@@ -286,6 +327,45 @@ def test_a_command_whose_reader_has_gone_says_nothing():
     done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, env=environment)
     os.close(writing)
     assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_help_whose_reader_has_gone_says_nothing(monkeypatch, capsys):
+    def helped(_):
+        print("help")
+        sys.exit(0)
+
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        with pytest.raises(SystemExit) as stop:
+            command.run("mi_ring.fit", helped, [])
+    assert stop.value.code == 141 and capsys.readouterr().err == ""
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="only Linux has it")
+def test_output_to_a_full_disk_is_one_line(monkeypatch, capsys):
+    with open("/dev/full", "w") as full:  # whose end would fail again
+        monkeypatch.setattr(sys, "stdout", full)
+        with pytest.raises(SystemExit) as stop:
+            command.run("mi_ring.check", lambda _: print("table"), [])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == f"mi_ring.check: standard output, or a file: {os.strerror(errno.ENOSPC)}\n"
+
+
+def test_a_command_without_streams_works(monkeypatch):
+    """As after `<&- >&- 2>&-`, where Python has none."""
+
+    def talks(_):
+        print("table")
+        print("found", file=sys.stderr)
+        assert sys.stdin.read() == ""
+
+    for name in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    with pytest.raises(SystemExit) as stop:
+        command.run("mi_ring.check", talks, [])
+    assert stop.value.code == 0
 
 
 def test_an_exr_is_written_and_read_on_a_single_thread(tmp_path):

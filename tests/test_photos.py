@@ -256,6 +256,15 @@ def test_damaged_photographs_are_named_together(tmp_path):
     assert not (tmp_path / "sheet.json").exists()
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 5000), (2000, 50)])
+def test_photographs_too_small_or_too_narrow_for_features_are_named(size, tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (9, 60, 80, 3), np.uint8)
+    for k, pixels in enumerate(noise):
+        Image.fromarray(pixels).resize(size if k == 4 else (80, 60)).save(tmp_path / f"{k}.png")
+    with pytest.raises(InputError, match=r"4.png: is {} x {} pixels; the shorter side must .*; repair".format(*size)):
+        find_sheet(find_pictures(tmp_path), 1.0, tmp_path, progress)
+
+
 def test_inks_are_not_taken_for_light(tmp_path):
     inks = Image.new("CMYK", (9, 7), (20, 90, 200, 10))
     inks.save(tmp_path / "a.tif")

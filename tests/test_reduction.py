@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -176,6 +177,23 @@ def test_damage_anywhere_in_a_cached_file_is_noticed(byte, own_cache):
         content[entry.start() + byte] ^= 0xA1
     cache.store(key, bytes(content))
     assert reduction.unpacked(key, "masks", lambda: "made") == "made" and not cache.cached(key)
+
+
+def test_garbage_of_the_right_length_in_the_cache_is_noticed(tmp_path, monkeypatch, own_cache):
+    """Also where the folder is read-only, so that it cannot be removed."""
+    path = capture_of(tmp_path)
+    first = load_capture(path, width=200)
+    entries = {file: file.read_bytes() for _, _, file in cache.files()}
+    for file, content in entries.items():
+        file.write_bytes(np.random.default_rng(1).bytes(len(content)))
+    with monkeypatch.context() as read_only:
+        read_only.setattr(Path, "unlink", Mock(side_effect=PermissionError("read-only")))
+        read_only.setattr(cache, "store", lambda key, content: False)
+        second = load_capture(path, width=200)
+        assert [shot.window for shot in second.shots] == [shot.window for shot in first.shots]
+        assert (second.observe([0]).rgb == first.observe([0]).rgb).all()
+    load_capture(path, width=200)
+    assert {file: file.read_bytes() for _, _, file in cache.files()}.keys() == entries.keys()
 
 
 def test_what_is_in_the_cache_is_of_these_masks_alone(tmp_path):

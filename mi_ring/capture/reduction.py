@@ -123,9 +123,10 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
         assert read is not None
         file = source(read) if large else None
         key = file and key_of("bounds", file)
-        with contextlib.suppress(OSError, ValueError):  # another process has removed it, or it is damaged
+        with contextlib.suppress(Exception):  # another process has removed it, or it is damaged in any way
             if path := key and cache.cached(key):
-                return np.frombuffer(path.read_bytes(), np.int32).reshape(2, 2)
+                with np.load(path) as stored:  # of a .npz file, checksums are verified
+                    return stored["bounds"]
         inside = read() > 127  # not kept: it may be large
         columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
         found = np.zeros((2, 2), np.int32)
@@ -134,7 +135,7 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
             if shot.window:  # in pixels of the photograph
                 found = np.clip((found + MORE) * shot.window.scale, 0, shot.window.whole).astype(np.int32)
         if key:
-            cache.store(key, found.tobytes())
+            cache.store(key, archived({"bounds": found}))
         return found
 
     found = dict(zip(several, in_turn(bounds, capture, list(several.values()), "reading masks")))
@@ -295,9 +296,13 @@ def packed(arrays: dict[str, Any]) -> memoryview:
     `arrays`: a dict with "images" (a `LinearImage`), and "masks" and "valid" if the photograph has them.
     """
     image = arrays["images"]
-    content = arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped)}
+    return archived(arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped)})
+
+
+def archived(arrays: dict[str, np.ndarray]) -> memoryview:
+    """Return the bytes of a .npz file of arrays by name."""
     buffer = io.BytesIO()
-    np.savez(buffer, **content)
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # mypy takes the arrays for options
     return buffer.getbuffer()
 
 
@@ -317,5 +322,6 @@ def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | Linea
             return LinearImage(array, clipped.astype(bool))
     except Exception:  # numpy and zipfile raise errors of all kinds for damaged files
         if path:
-            path.unlink(missing_ok=True)  # so that it is made anew the next time
+            with contextlib.suppress(OSError):  # the folder may be read-only
+                path.unlink()  # so that it is made anew the next time
         return make()

@@ -64,12 +64,12 @@ class Fit(Renamed):
         terms: Mapping[str, TermLike] | None = None, callbacks: Sequence[Callable[[Iteration], object]] = (),
         state: dict[str, Any] | None = None, lighting: Lighting | None = None,
     ) -> None:  # fmt: skip
-        config = config or Config()
-        require_settings(capture, config)
+        config = Config() if config is None else config
+        require_settings(capture, config, lighting)
         self.loss, self.callbacks = Loss(terms, config.weights), list(callbacks)
-        if state and networks:
+        if state is not None and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
-        lighting, ring = restored(state) if state else (lighting, None)
+        lighting, ring = (lighting, None) if state is None else restored(state)
         if config.deterministic:
             recompute_normals(capture.scene)
         self.problem = Problem.of(capture, config, lighting or Lighting.of(capture, config))
@@ -83,7 +83,7 @@ class Fit(Renamed):
         self.optimisation = Optimisation(self.problem, self.model, self.loss.terms)
         self.regulariser, self.course = RegulariserStrength(), Course()
         self.capture = self.problem.capture  #: with the masks that are used now
-        if state:
+        if state is not None:
             self.restore(copy.deepcopy(state))
         self.optimisation.settle(self.schedule, self.iteration)
 

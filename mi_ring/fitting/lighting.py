@@ -7,7 +7,7 @@ be about one half, in each colour.
 import math
 from collections.abc import Collection
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from torch import Tensor
@@ -65,6 +65,16 @@ class Lighting(NamedTuple):
         if progress >= self.one_material_until:
             return material
         return {name: value.mean(0, keepdim=True).expand_as(value) for name, value in material.items()}
+
+
+def require_lighting(lighting: Lighting | None) -> None:
+    """Raise InputError if `lighting`, which a caller gave to a fit, is no lighting. None is allowed."""
+    if lighting is None:
+        return
+    if not (isinstance(lighting, Lighting) and lighting.kind in get_args(Kind)
+            and bool(lighting.lamps) == (lighting.kind == "lamps")):  # fmt: skip
+        raise InputError(f"lighting: is {lighting!r}; give Fit what mi_ring.choose_lighting(capture, config) returns, "
+                         "and the kind of light as Config(light=...)")  # fmt: skip
 
 
 def require_compatible(capture: Capture, config: Config) -> None:

@@ -15,7 +15,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.reflectance import predicted_parameters
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.lighting import Lighting
+from mi_ring.fitting.lighting import Lighting, require_lighting
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import Refinement
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
@@ -31,11 +31,12 @@ from mi_ring.system.optional import installed
 DISPROPORTIONATE = 20.0  #: ratio of size, or distance in radii, of start surface and normalising sphere: a mistake
 
 
-def require_settings(capture: Capture, config: Config) -> None:
-    """Raise InputError if `capture` or `config` has a wrong type, or if a setting contradicts the capture."""
+def require_settings(capture: Capture, config: Config, lighting: Lighting | None) -> None:
+    """Raise InputError if a setting contradicts the capture, or if an argument has another type."""
     for name, value, kind in (("capture", capture, Capture), ("config", config, Config)):
         if not isinstance(value, kind):
             raise InputError(f"{name}: is {type(value).__name__}, must be a mi_ring.{kind.__name__}")
+    require_lighting(lighting)
     if not capture.images:
         raise InputError(f"{capture.path}: photographs: were not read; call load_capture without images=False")
     if {"curve", "contrast"} & set(config.refine) and any(shot.files.ambient for shot in capture.shots):

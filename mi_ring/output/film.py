@@ -11,7 +11,7 @@ import numpy as np
 
 from mi_ring.errors import InputError
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
-from mi_ring.system.files import writing
+from mi_ring.system.files import partial_path, writing
 
 
 def write_picture(linear: np.ndarray, path: Path) -> None:
@@ -26,7 +26,7 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int]
     `size`: (width, height) [px] of the pictures. If one is odd, the film gets one more column or row. `fps`: pictures
     per second. Raises InputError if the file cannot be written. After an error there is no partial file.
     """
-    partial = path.with_name(f".{path.stem}.partial.mp4")
+    partial = partial_path(path)  # without .mp4, so that ffmpeg must be told the format
     odd_columns, odd_rows = size[0] % 2, size[1] % 2
     # Not by imageio, which does not notice a truncated film, for instance on a full disk.
     ffmpeg = subprocess.Popen(
@@ -36,7 +36,7 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int]
             "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
             # The colour space; otherwise browsers guess it from the size of the pictures.
             "-vf", "scale=out_color_matrix=bt709,setparams=color_primaries=bt709:color_trc=iec61966-2-1",
-            f"file:{partial}",
+            "-f", "mp4", f"file:{partial}",
         ],
         stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,  # so that Ctrl-C does not stop it
     )  # fmt: skip

@@ -12,8 +12,10 @@ import torch
 from PIL import Image
 
 from mi_ring.errors import InputError
+from mi_ring.images import encoded_picture
 from mi_ring.nets.chunks import in_parallel
 from mi_ring.photogrammetry.folder import DECODED, Picture, focal_35mm
+from mi_ring.system.files import write_file
 from mi_ring.system.machine import cores, in_threads, interruptible
 from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
@@ -54,7 +56,7 @@ def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Pict
     def write_grey(picture: Picture) -> tuple[int, int]:
         reduced = Image.fromarray(picture.grey(LONGEST))
         picture.close()
-        reduced.save(grey / grey_file(picture))
+        write_file(grey / grey_file(picture), encoded_picture(reduced))
         return reduced.size
 
     for size in dict.fromkeys(picture.size for picture in pictures):  # one camera each
@@ -272,7 +274,7 @@ def match_by_library(pairs: Sequence[tuple[str, str]], folder: Path, guided: boo
     `guided`: search once more along the epipolar lines.
     """
     listed = folder / "pairs.txt"
-    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), "utf-8")
+    write_file(listed, "".join(f"{a} {b}\n" for a, b in pairs))
     options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=guided)
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     interruptible(pycolmap.match_image_pairs, folder / "database.db", options, pairing, verification())

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mi_ring.capture.arrays import FLATTEST
 from mi_ring.errors import InputError
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.colmap import Colmap
@@ -30,6 +31,7 @@ from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
 from mi_ring.system.progress import Progress
 
+SMALLEST = 32  #: shorter side of a photograph [px]
 MIN_DEGREES = 15.0  #: between the directions of two of the photographs
 MIN_DETECTIONS = 3  #: photographs that must show the sheet
 FORMAT = 3  #: version of the saved results; increase it when they change
@@ -90,6 +92,9 @@ def find_sheet(
 
         def observe(picture: Picture) -> list | InputError | None:
             try:
+                if max(SMALLEST, max(picture.size) / FLATTEST) > min(picture.size):
+                    raise InputError("{}: is {} x {} pixels; the shorter side must be at least {}, and an {}th of the "
+                                     "longer one".format(picture.path, *picture.size, SMALLEST, FLATTEST))  # fmt: skip
                 detection = MarkerSheet(1.0).detect(picture.srgb())
                 paper = sample_paper(picture.pixels[:, :, :3], detection, picture.to_linear) if detection else ()
                 return [a.tolist() for a in (*detection, *paper)] if detection else None
@@ -103,7 +108,7 @@ def find_sheet(
         results = list(progress(in_threads(observe, pictures, most=DECODED), "sheet", len(pictures)))
         if bad := [(p.path.name, error) for p, error in zip(pictures, results) if isinstance(error, InputError)]:
             names = ", ".join(name for name, _ in bad)
-            more = f"{len(bad)} photographs cannot be read: {names}; repair or remove them"
+            more = f"{len(bad)} photographs cannot be used: {names}; repair or remove them"
             raise InputError(f"{bad[0][1]}; {more if len(bad) > 1 else 'repair or remove it'}")
         saved = {picture.name: values for picture, values in zip(pictures, results) if values}
         write_file(record, json.dumps(saved))

@@ -17,6 +17,7 @@ from mi_ring.scene.shot import Files, Shot
 from mi_ring.synthesis.object_on_table import ObjectOnTable
 from mi_ring.synthesis.tracing import LensCamera
 from mi_ring.synthesis.viewpoints import GOLDEN, look_at
+from mi_ring.system.files import write_file
 from mi_ring.system.progress import progress
 
 CENTER, HEIGHT = np.array([40.0, -15.0, 110.0]), 80.0  #: of the pot [mm]; y is up
@@ -91,7 +92,9 @@ def write_example(folder: Path, spp: int = SPP) -> None:
     mesh.set_bsdf(mi.load_dict(glaze))
     for name in ("images", "masks", "truth"):
         (folder / name).mkdir()
-    mesh.write_ply(str(folder / "truth" / "mesh.ply"))
+    stream = mi.MemoryStream()  # Mitsuba's own files end in a RuntimeError on a full disk
+    mesh.write_ply(stream)
+    write_file(folder / "truth/mesh.ply", stream.raw_buffer())
     scene, elements = ObjectOnTable(mesh, vertices), list[Element]()
     for k, camera in enumerate(progress(cameras(), "photographing", unit="photograph", leave=True)):
         position = camera.position + camera.to_world[:3, :3] @ FLASH
@@ -102,4 +105,4 @@ def write_example(folder: Path, spp: int = SPP) -> None:
         write_image(to_bytes(scene.coverage(view)[..., None] >= 0.5), folder / "masks" / f"{name}.png")
         files = Files(Path(f"images/{name}.png"), Path(f"masks/{name}.png"))
         elements.append(photograph_element(Shot(name, camera, light, files=files, calibrated=True)))
-    (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements)))
+    write_file(folder / "scene.xml", scene_bytes(scene_element(elements)))

@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import difflib
+import errno
 import io
 import itertools
 import math
@@ -25,6 +26,7 @@ from mi_ring.system import llvm
 MAX_MESSAGE = 800  #: characters of an error message
 #: Signals that end a command: Ctrl-C; `kill` and schedulers; a terminal that closes (not on Windows).
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  #: of a full disk, a quota, and `ulimit -f`
 REPEATED = 5.0  #: a second SIGTERM or SIGHUP within this time is a copy of the first [s]
 
 
@@ -38,6 +40,8 @@ def parse(
     the docstring of the dataclass. Raises InputError for wrong arguments. With `needs_llvm`, it also raises InputError
     if there is no LLVM, but not for the help.
     """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # set by the import of mi_ring
+        signal.signal(signal.SIGINT, receive)  # from here on, there may be partial files to remove
     for word in (*arguments, os.getcwd()):
         require_utf8(word)
     words, box = ["--help" if word == "--help-all" else word for word in arguments], io.StringIO()
@@ -138,11 +142,20 @@ def exit_status(stop: KeyboardInterrupt) -> int:
     return 128 + (stop.args[0] if isinstance(stop, Interrupted) else signal.SIGINT)
 
 
-_received: list[tuple[int, float]] = []  #: signals within `resumable`: number, time of arrival [s]
+_received: list[tuple[int, float]] = []  #: signals that `receive` has handled: number, time of arrival [s]
+
+
+def receive(number: int, frame: object) -> None:
+    """Handle a signal: raise Interrupted, and record the signal."""
+    before, now = _received[-1][1] if _received else -math.inf, time.monotonic()
+    _received.append((number, now))
+    # Shells, schedulers and the kernel may send a signal several times. Each Ctrl-C is meant.
+    if number == signal.SIGINT or now - before > REPEATED:
+        raise Interrupted(number)
 
 
 def interrupted() -> bool:
-    """Return whether a signal has arrived within `resumable`. Native code may have turned it into another error."""
+    """Return whether `receive` has handled a signal. Native code may have turned it into another error."""
     return bool(_received)
 
 
@@ -153,13 +166,6 @@ def resumable() -> Iterator[None]:
     It then raises Interrupted, even if a library turns the signal into another error. Only the main thread receives
     signals.
     """
-
-    def receive(number: int, frame: object) -> None:
-        before, now = _received[-1][1] if _received else -math.inf, time.monotonic()
-        _received.append((number, now))
-        # Shells, schedulers and the kernel may send a signal several times. Each Ctrl-C is meant.
-        if number == signal.SIGINT or now - before > REPEATED:
-            raise Interrupted(number)
 
     handled = []
     if threading.current_thread() is threading.main_thread():
@@ -197,19 +203,40 @@ def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Se
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     traceback = "--traceback" in arguments
     arguments = [argument for argument in arguments if argument != "--traceback"]
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed, as by `>&-`: a file of ours must not take its place
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
     try:
-        status = main(arguments) or 0
+        try:
+            status: Any = main(arguments) or 0
+        except SystemExit as stop:  # after --help
+            status = stop.code
         sys.stdout.flush()  # so that a broken pipe is noticed here
         sys.exit(status)
     except KeyboardInterrupt as stop:
         sys.exit(exit_status(stop))
     except BrokenPipeError:  # `mi-ring … | head` has stopped reading
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        finish_output()
         sys.exit(141)
-    except (InputError, OSError) as error:
-        # An OSError with a file name is a user error: no permission, a removed folder. Others are bugs.
-        if traceback or (isinstance(error, OSError) and not (error.filename and error.strerror)):
+    except Exception as error:
+        if _received:  # Mitsuba and others make errors of their own of a Ctrl-C
+            sys.exit(128 + _received[0][0])
+        message = str(error)
+        if isinstance(error, OSError) and error.strerror and (error.filename or error.errno in FULL):
+            # A user error: no permission, a removed folder, a full disk. Other OSErrors are bugs.
+            message = f"{error.filename or 'standard output, or a file'}: {error.strerror}"
+        elif not isinstance(error, InputError):
             raise
-        message = str(error) if isinstance(error, InputError) else f"{error.filename}: {error.strerror}"
+        if traceback:
+            raise
+        finish_output()
         print(f"{program}: {one_line(message)}", file=sys.stderr)
         sys.exit(2)
+
+
+def finish_output() -> None:
+    """Write the buffered standard output. If that fails, drop it; otherwise, it would fail again at exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
