@@ -128,7 +128,7 @@ def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.
 def numbers(
     parent: ElementTree.Element, name: str, shape: tuple[int, ...], what: str, default: np.ndarray | None = None
 ) -> np.ndarray:
-    """Read the numbers in the child element `name` of an XML element. Returns an array of this `shape`.
+    """Read the numbers in the child element `name` of the XML element `parent`. Returns an array of this `shape`.
 
     `default`: result if the child is missing; None: this is an error. Raises InputError if the numbers are missing or
     invalid. The message begins with `what`.

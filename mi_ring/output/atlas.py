@@ -114,8 +114,8 @@ def seamless_surface(
     """Compute positions and normals of a mesh whose vertices are duplicated along seams. Normals have no seams.
 
     `s` (V, 3): points of the domain, one for each vertex. `faces` (F, 3): triangles. `time`: state of the deformation,
-    from 0 (start surface) to 1 (fitted object). Returns (positions (V, 3) in the normalised frame, normals (V, 3),
-    numbers (V,) of the vertices without duplicates: duplicates have the same number).
+    from 0 (start surface) to 1 (fitted object). Returns (positions (V, 3) in the normalised frame, unit normals (V, 3),
+    vertex numbers (V,), which are equal for duplicates of one vertex).
     """
     unique, uncut = np.unique(s, axis=0, return_inverse=True)
     uncut = uncut.ravel()
@@ -136,9 +136,9 @@ class Texels:
 def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
     """Compute the domain point and the normal of each texel of an atlas.
 
-    `resolution`: width and height of the texture [texels]. `time`: state of the deformation, from 0 (start surface) to
-    1 (fitted object); the same as for `atlas`. If `ring.subdivisions` is finer than the mesh of the atlas, the normals
-    come from this finer mesh.
+    `resolution`: width and height of the texture [texels]. `time`: state of the deformation for which the atlas was
+    made, from 0 (start surface) to 1 (fitted object). If `ring.subdivisions` is finer than the mesh of the atlas, the
+    normals come from this finer mesh.
     """
     bitangents = np.cross(atlas.normals, atlas.tangents[:, :3]) * atlas.tangents[:, 3:]
     s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals

@@ -228,8 +228,8 @@ def render_views(
 ) -> Iterator[np.ndarray]:  # fmt: skip
     """Render the views one by one. Yields pictures (H, W, 3) of linear radiance.
 
-    `surface`: surface that draws `ring`; it is changed. `integrator`: Mitsuba integrator; None: mi_ring's own renderer,
-    photometric. `capture`: for photometric, it gives the room light and says whether there are shadows.
+    `surface`: has the scene to render; `ring` is written to its mesh. `integrator`: Mitsuba integrator; None: mi_ring's
+    own renderer, photometric. `capture`: for photometric, it gives the room light and says whether there are shadows.
     """
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None

@@ -241,7 +241,7 @@ def model_points(model: Any) -> np.ndarray:
 
 
 def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: Path) -> dict[str, str]:
-    """Find out why photographs have no camera. Returns a text for the user by the photograph's name.
+    """Find out why photographs have no camera. Returns texts for the user by the photograph's name.
 
     `placed`: names of the photographs that have a camera. `folder`: has the database and the grey images.
     """

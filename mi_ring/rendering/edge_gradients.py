@@ -15,9 +15,10 @@ def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
 
     Each entry has one value per sample of the curve: `where`, pixel coordinates; `view`, index of the photograph;
     `step`, [R, G, B, coverage] to add to the pixel at `where`; `active`, False for samples to ignore. The values of
-    `step` are 0. Their derivative dI is the boundary term: an edge that moves by n·dq [px] sweeps length · n·dq square
-    pixels, in which the radiance changes from L_beyond to L_before, so dI = (L_before − L_beyond) · n·dq · length. Both
-    radiances are traced along rays beside the edge, with occlusion, background, coverage and shadows as in the picture.
+    `step` are 0. Their derivative dI is the boundary term. Let n be the normal of the edge in the picture. If the edge
+    moves by dq [px], it sweeps length · n·dq square pixels. There, the radiance changes from L_beyond, on the side to
+    which n points, to L_before, on the other side. So dI = (L_before − L_beyond) · n·dq · length. Both radiances are
+    traced along rays beside the edge, with occlusion, background, coverage and shadows as in the picture.
 
     `edges`: the edges of the scene. `shadows`: also edges of shadows. `window`: (lowest, highest) corner [px] of the
     part that is rendered; edges outside of it are skipped; None: all is rendered.

@@ -41,11 +41,11 @@ class GlobalIllumination:
     ) -> "GlobalIllumination":  # fmt: skip
         """Render small pictures of interreflection and room light for the current surface, without gradients.
 
-        `photographs`: the N photographs. `coverage` (N, H, W): coverage in the large pictures. `width`: largest side of
-        the small pictures [px], `paths`: paths per pixel. None: 32 px and 16 paths, or 128 px and 3 paths if the scene
-        has a table. This light varies slowly, so a few good pixels are better than many noisy ones. `indirect`: False:
-        no interreflection; the room light then has its occlusion, but is reflected only once. `harmonics`: indices of
-        the spherical harmonics of room light; empty: no room light.
+        `photographs`: the N photographs. `coverage` (N, H, W): their coverage, rendered at full size. `width`: largest
+        side of the small pictures [px]. `paths`: paths per pixel. If these are None: 32 px and 16 paths, or 128 px and
+        3 paths if the scene has a table. This light varies slowly, so a few good pixels are better than many noisy
+        ones. `indirect`: False: no interreflection; the room light then has its occlusion, but is reflected only once.
+        `harmonics`: indices of the spherical harmonics of room light; empty: no room light.
         """
         bounces = BOUNCES if indirect else 1
         table = surface.table if indirect else None  # a table reflects light; alone it would hide the room's

@@ -113,10 +113,11 @@ class Lights:
 
 
 def flash_falloff(direction, to_world, falloff):
-    """Compute the factor by which a flash is weaker away from its axis: the cosine of the angle to it ^ `falloff`.
+    """Compute the factor by which a flash is weaker away from its axis: cosine ^ `falloff`, 1 on the axis.
 
-    `direction`: unit vector from the surface to the flash. `to_world`: pose of the camera, whose optical axis is the
-    axis of the flash. `falloff`: exponent; 0: the flash is equal in all directions.
+    The cosine is of the angle between the axis and the direction from the flash to the surface. `direction`: unit
+    vector from the surface to the flash. `to_world`: pose of the camera, whose optical axis is the axis of the flash.
+    `falloff`: exponent; 0: the flash is equal in all directions.
     """
     cosine = -dr.dot(direction, mi.Vector3f(to_world[0, 2], to_world[1, 2], to_world[2, 2]))
     return dr.power(dr.maximum(cosine, MIN_FLASH_COSINE), falloff)

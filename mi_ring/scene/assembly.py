@@ -79,7 +79,10 @@ def move_lamps(scene, places, strengths) -> None:
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
-    """Make a Mitsuba scene of these objects. They keep their ids, and meshes are not merged."""
+    """Make a Mitsuba scene of shapes, emitters, sensors and an integrator. Returns the scene.
+
+    These objects keep their ids. Meshes are not merged. `emitters`: those that do not belong to a shape.
+    """
     parts = [*shapes, *emitters, *sensors, *([integrator] if integrator else [])]
     ids = [part.id() for part in parts]
     everything = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
@@ -105,9 +108,10 @@ def with_fitted_shape(
 ) -> tuple[mi.Scene, mi.Mesh]:
     """Make a scene in which a new shape replaces `shape`. Returns (new scene, new shape).
 
-    The new shape has the BSDF of `ring` and the mesh attributes that this BSDF reads, all 0. Its vertices are not those
-    of the object yet. They lie on a sphere around the object, because Mitsuba places distant emitters outside of the
-    scene's bounding sphere when the scene is made. `unit`: length of the unit of the new scene [units of `ring`].
+    The new shape has the BSDF of `ring` and the mesh attributes that this BSDF reads, with arbitrary values. Its
+    vertices are not those of the object yet. They lie on a sphere around the object, because Mitsuba places distant
+    emitters outside of the scene's bounding sphere when the scene is made. `unit`: length unit of the new scene [units
+    of `ring`].
     """
     new = mi.load_dict({
         "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),

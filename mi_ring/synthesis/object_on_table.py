@@ -129,7 +129,7 @@ def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimes
 
 
 def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, pattern: Pattern | None) -> mi.Mesh:
-    """Make a Mitsuba mesh with smooth normals and this BSDF.
+    """Make a Mitsuba mesh with smooth normals and the material `bsdf`.
 
     `colours` (V, 3): linear colours of the vertices, for the mesh attribute vertex_color; None: no such attribute.
     `pattern`: has the texture coordinates; None: no texture coordinates.

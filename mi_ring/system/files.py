@@ -145,7 +145,10 @@ def read_json(path: Path) -> Any:
 
 
 def quoted(content: bytes) -> list[str]:
-    """Return all quoted strings in the bytes of an XML file. Among them are the names of the files that it uses."""
+    """Return all quoted strings in an XML file. Among them are the names of the files that it uses.
+
+    `content`: the bytes of the file.
+    """
     strings = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", content)
     return [(double or single).decode(errors="replace") for double, single in strings]
 

@@ -108,7 +108,7 @@ def in_threads(function: Callable[..., Result], *things: Iterable, most: int | N
 def pipelined(
     first: Callable[[Thing], Part], second: Callable[[Thing, Part], Result], things: Iterable[Thing]
 ) -> Iterator[Result]:
-    """Yield `second(thing, first(thing))` for each of `things`, in order.
+    """Yield `second(thing, first(thing))` for each of `things`, in the same order.
 
     While `second` runs in another thread, `first` already works on the next thing. But if Dr.Jit has only one thread,
     both run one after the other, because reading an EXR file in `second` must not change that number while `first`
