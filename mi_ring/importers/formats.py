@@ -144,7 +144,7 @@ def guess(src: Path) -> tuple[str, Path]:
 
 
 def accepts(check: Callable[[Path], Any], path: Path) -> bool:
-    """Return True if `check(path)` is true, False if it is not or if the file cannot be read."""
+    """Return True if `check(path)` is true; False if it is false or if the file cannot be read."""
     try:
         return bool(check(path))
     except (InputError, OSError, LookupError):

@@ -247,10 +247,10 @@ def render_views(
 
 
 def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """Render a picture with a Mitsuba integrator in several passes. Returns their mean (H, W, 3), linear radiance.
+    """Render a picture with a Mitsuba integrator. Returns linear radiance (H, W, 3).
 
-    So memory does not grow with the samples per pixel `spp`. A pass has at most `LANES` rays, but at least one per
-    pixel.
+    It is the mean of several passes, so that memory does not grow with `spp`, the samples per pixel. A pass has at most
+    `LANES` rays, but at least one per pixel. `sensor`: Mitsuba's sensor with its film.
     """
     width, height = sensor.camera.size
     at_once = min(spp, max(1, LANES // (width * height)))

@@ -246,7 +246,8 @@ def panels_of(
 def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tuple[PhotographPanel, float]:
     """Compare photograph `k` with its prediction. Returns (panel for the report, mean squared sRGB error).
 
-    The error is over the valid pixels, or in a lit room over those inside the mask if there is one.
+    The error is the mean over all valid pixels. If the room was lit and the photograph has a mask, it is the mean over
+    the valid pixels in the mask.
     """
     capture, brdf_net = result.capture, result.ring.brdf_net
     scale = scale_of(result, capture.shots[k].size)

@@ -188,9 +188,10 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
 
 
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
-    """Write the masks of the photographs `index` (integers) as PNG files: NAME.png in `folder` for a photograph NAME.
+    """Write masks as PNG files into `folder`: NAME.png for a photograph NAME.
 
-    Returns the file names with the indices as keys. They are relative to the parent of `folder`.
+    `index`: indices of the photographs whose masks are written. Returns the file names with these indices as keys. They
+    are relative to the parent of `folder`.
     """
     names = {}
     for k in index:

@@ -129,7 +129,7 @@ class VoxelGrid:
 
 
 def empty_masks(views: Views) -> list[np.ndarray]:
-    """Return a mask (H, W) uint8 for each view that is 0 everywhere."""
+    """Return for each view a mask (H, W) uint8 that is 0 everywhere."""
     return [np.zeros(view.valid.shape, np.uint8) for view in views]
 
 

@@ -146,7 +146,7 @@ class Picture:
         return np.array(Image.fromarray(rgb[:height, :width]).convert("L").reduce(scale))
 
     def srgb(self) -> np.ndarray:
-        """Return the photograph as 8-bit sRGB, (H, W, 3) uint8. The brightness of a raw file is adjusted."""
+        """Return the photograph as 8-bit sRGB, (H, W, 3) uint8. A raw file is scaled to a usual brightness."""
         rgb = self.pixels[:, :, :3]
         if rgb.dtype == np.uint8:
             return rgb

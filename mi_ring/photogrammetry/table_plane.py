@@ -237,7 +237,7 @@ def bare_table(
 
     `silhouettes`: for each view, a rough mask (H, W) of the object. `tables`: appearances of the table. Each pixel is
     compared with the first appearance that covers it. At first, darker pixels count as table in shadow. If too much of
-    the object then looks like the table, they no longer count. Returns None if the object still looks like the table.
+    the object then looks like the table, darker pixels no longer count. Returns None if that does not help.
     """
     differences = []
     for view in progress(views, "bare table"):

@@ -80,11 +80,11 @@ class Edges:
         return front
 
     def sides(self, fronts, lanes=None, views=1):
-        """Look up whether the triangles at edges face the eye. Returns (edge, first, second) for each lane.
+        """Look up whether the two triangles at edges face the eye (camera or light). Returns (edge, first, second).
 
-        `edge` is the number of the edge; `first` and `second` are True if the first and the second triangle at the edge
-        face the eye. `fronts`: whether each triangle does, in `views` photographs one after the other. `lanes`
-        (UInt32): photograph · number of edges + edge; None: all edges in all photographs.
+        These have one value per lane: the number of the edge, and for its first and second triangle True if it faces
+        the eye. `fronts`: a Bool for each triangle in each photograph, one photograph after the other: True if it faces
+        the eye. `lanes` (UInt32): photograph · number of edges + edge; None: all edges in `views` photographs.
         """
         count, triangles = dr.width(self.kind), dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views) if lanes is None else lanes
@@ -144,11 +144,11 @@ class Edges:
         return curves, fronts
 
     def shadow_casters(self, light, views, seed, seen, before=0):
-        """Sample the edges from which edges of shadows come. Returns (casters, terminators), two lists of samples.
+        """Sample the edges of shapes that cause edges of shadows. Returns (casters, terminators), two lists of samples.
 
-        Casters are outlines as seen from the light; their shadows fall onto other surfaces. Terminators are those
-        casters of which the camera sees both triangles: there, light ends on the surface itself, because one triangle
-        faces the light and the other does not and is black.
+        Casters are outlines as seen from the light; their shadows fall onto other surfaces. A terminator is a caster of
+        a mesh at which the camera sees both adjacent triangles: the shadow begins at this edge itself, because one
+        triangle faces the light and the other does not and is black.
 
         `light`: function from photograph indices to (position, True) or (direction toward it, False). `views`: number
         of photographs. `seen`: a Bool for each triangle in each photograph, one photograph after the other: True if the

@@ -61,31 +61,35 @@ class GlobalIllumination:
 
     @property
     def interreflection(self) -> Tensor:
-        """Linear radiance (N, H, W, 3) by interreflection, to add to the large pictures. Room light is not included."""
+        """Linear radiance (N, H, W, 3) that interreflection adds to the photographs at full size.
+
+        Interreflection of room light is not included.
+        """
         return self.upsampled(self.radiance)
 
     def room_light(self, room: Tensor) -> Tensor:
-        """Compute the linear radiance (N, H, W, 3) by room light, with occlusion, to add to the large pictures.
+        """Compute the linear radiance (N, H, W, 3) that room light adds to the photographs at full size.
 
-        `room` (BASIS, 3): spherical harmonics of the room light; only those in `harmonics` count.
+        It includes the shadows of the room light. `room` (BASIS, 3): spherical harmonics of the room light; only those
+        in `harmonics` count.
         """
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
 
     def occlusion(self, room: Tensor) -> Tensor:
-        """Compute the linear radiance (N, H, W, 3) to add to large pictures that contain room light without occlusion.
+        """Compute what to add to photographs at full size that contain room light as if nothing blocked it.
 
-        It adds the shadows of the room light, as negative values, and the interreflection of the room light. `room`
-        (BASIS, 3): spherical harmonics of the room light.
+        Returns linear radiance (N, H, W, 3): the shadows of the room light, as negative values, and its
+        interreflection. `room` (BASIS, 3): spherical harmonics of the room light; only those in `harmonics` count.
         """
         difference = self.transfer - self.unoccluded
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))
 
     def upsampled(self, rgb: Tensor) -> Tensor:
-        """Enlarge small pictures `rgb` (N, h, w, 3) to (N, H, W, 3), with the outlines of the large pictures.
+        """Enlarge small pictures `rgb` (N, h, w, 3) to the photographs' full size (N, H, W, 3), with sharp outlines.
 
-        The result has gradients with respect to `coverage` only: this light acts on the outline, but not on shape and
-        material. A fit takes it into account for shape and material by its iterations, as in "Shape from
-        Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
+        The outlines come from `coverage`, and the result has gradients with respect to `coverage` only: this light acts
+        on the outline, but not on shape and material. A fit takes it into account for shape and material by its
+        iterations, as in "Shape from Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
         """
         images = torch.cat([rgb, self.alpha[..., None]], -1).movedim(-1, 1)
         images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)

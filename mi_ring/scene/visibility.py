@@ -39,16 +39,18 @@ class Visibility:
         self.views = list(dict(zip(keys, views)).values())
 
     def of_vertices(self) -> np.ndarray:
-        """Test all vertices of the mesh. Returns (V,) bool: True if a camera sees the vertex.
+        """Test all vertices of the mesh. Returns (V,) bool: True if at least one camera sees the vertex.
 
-        A vertex faces a camera if its smooth normal does.
+        A camera sees a vertex if the smooth normal points to the camera's side, if the vertex projects to a valid
+        pixel, and if the mesh does not hide it.
         """
         return self.of_points(self.vertices, np.array(mi.traverse(self.mesh)["vertex_normals"]).reshape(-1, 3))
 
     def of_points(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Test points of the surface. Returns (N,) bool: True if a camera sees the point.
+        """Test points of the surface. Returns (N,) bool: True if at least one camera sees the point.
 
-        `points` (N, 3): [scene units]. `normals` (N, 3): unit normals at the points.
+        A camera sees a point if the normal points to the camera's side, if the point projects to a valid pixel, and if
+        the mesh does not hide it. `points` (N, 3): [scene units]. `normals` (N, 3): unit normals at the points.
         """
         points, normals = np.asarray(points, float), np.asarray(normals, float)  # trimesh has arrays of its own
         seen = np.zeros(len(points), bool)
