@@ -54,7 +54,7 @@ class PhotographFiles:
 
     @property
     def ordinary(self) -> list[Path]:
-        """The files outside of folders whose names say that they have no photographs, such as masks or depth."""
+        """The files without those in folders that have no photographs, which have names such as masks or depth."""
         return [file for file in self.files if not ASIDE.intersection(self.folders[file][self.below :])]
 
     def find(self, path: str) -> tuple[Path | None, bool]:

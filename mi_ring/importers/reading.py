@@ -38,7 +38,7 @@ def pixels_of(path: Path, heed: bool = False) -> np.ndarray:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return the (width, height) of an image file [px]. Reads only its head."""
+    """Return the (width, height) of an image file [px]. Reads no pixels."""
     return read_as(path, "image", image_headers.image_size)
 
 

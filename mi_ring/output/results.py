@@ -158,9 +158,8 @@ def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
 def write(folder: Path, result: FitResult, scene: bytes) -> None:
     """Write ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, which may be unfinished.
 
-    Also writes refined masks and the found environment, if there are any. `folder`: an existing results folder.
-    `scene`: scene file (XML) with the fitted object and the given calibration; this function puts in what the fit
-    refined.
+    Also writes masks and an environment map if the fit refined them. `folder`: an existing results folder. `scene`:
+    scene file (XML) with the fitted object and the given calibration; this function puts in what the fit refined.
     """
     ring, capture = result.ring, result.capture
     write_state(ring_state(ring, result.settings), folder / "ring.pt")

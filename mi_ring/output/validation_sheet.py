@@ -16,8 +16,8 @@ LEGEND = "Each photograph by its own exposure. Differences: red where photometri
 def strip(row: Comparison, pictures: Pictures) -> Image.Image:
     """Draw a row of the sheet for one photograph: pictures side by side, with the numbers of `row` above them.
 
-    `pictures`: renderings of the photograph by both methods. Each row has its own exposure. Differences are red where
-    mi_ring's own renderer, photometric, is brighter, and blue where it is darker.
+    `pictures`: renderings by mi_ring's own renderer, photometric, and by Mitsuba's path tracer. Each row has its own
+    exposure. Differences are red where photometric is brighter, and blue where it is darker.
     """
     photometric, unshadowed, path, direct = (p.mean(0) for p in vars(pictures).values())
     white = np.quantile(path[path > 0], 0.98) if (path > 0).any() else 1.0

@@ -52,7 +52,7 @@ def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation:
     """Reduce and undistort an image, and crop it to a window. Returns pixels (h, w, …) uint8.
 
     `image` (H, W, …) uint8: the whole photograph. `lens`: lens of the photograph. `window`: position, size and scale of
-    the result. `interpolation`: OpenCV's method.
+    the result. `interpolation`: OpenCV's flag for the undistortion.
     """
     height, width = (side // window.scale for side in image.shape[:2])
     whole = image[: height * window.scale, : width * window.scale]
@@ -101,10 +101,10 @@ def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
 
 
 def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
-    """Choose a window around the object in a photograph, with a margin, and its scale.
+    """Choose a window around the object in a photograph, with a margin, and the scale of its reduction.
 
-    `mask` (h, w): above 0 on the object, for the whole undistorted photograph, may be reduced. `pixels`: approximate
-    length of the object in the window after the reduction [px].
+    `lens`: lens of the photograph. `mask` (h, w): above 0 on the object. It covers the whole undistorted photograph,
+    and may be reduced. `pixels`: approximate length of the object in the reduced window [px].
     """
     rows, columns = np.nonzero(mask)
     size = np.array(lens.size)

@@ -38,7 +38,7 @@ class Pinhole(NamedTuple):
         return self.position, dr.normalize(direction)
 
     def local(self, vector):
-        """Convert a direction from world to camera coordinates. Gradients by each entry of `to_world` are correct."""
+        """Convert a direction from world to camera coordinates. The result carries gradients of `to_world`."""
         # Not by the transpose, though it is a rotation: the gradient with respect to each entry would be wrong.
         return dr.rcp(mi.Matrix3f([[self.to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
 

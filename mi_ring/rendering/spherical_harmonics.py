@@ -127,10 +127,10 @@ def bsdfs_with_lobes(scene) -> list:
 def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], active=True) -> list:
     """Compute the radiance that surface interactions reflect to the viewer in a room whose radiance is a harmonic.
 
-    Nothing blocks this light. Returns a Color3f for each index in `which`; they carry gradients. `bsdfs`: BSDFs with a
-    method `lobes`; all other BSDFs reflect nothing. `to_world`: pose of the camera. Each lobe of a BSDF multiplies each
-    degree of the harmonics by a factor, as in "A Signal-Processing Framework for Inverse Rendering" (Ramamoorthi and
-    Hanrahan 2001).
+    Nothing blocks this light. Returns a Color3f for each index of a harmonic in `which`; they carry gradients. `bsdfs`:
+    BSDFs with a method `lobes`; all other BSDFs reflect nothing. `to_world`: pose of the camera. Each lobe of a BSDF
+    multiplies each degree of the harmonics by a factor, as in "A Signal-Processing Framework for Inverse Rendering"
+    (Ramamoorthi and Hanrahan 2001).
     """
     total = [mi.Color3f(0) for _ in which]
     for bsdf in bsdfs:

@@ -49,7 +49,7 @@ class Surface:
         self.written = 0  #: number of times that vertices were written
 
     def set_faces(self, faces: np.ndarray) -> None:
-        """Set other triangles (F, 3). They are used from the next `write` on, which must come before rendering."""
+        """Set other triangles (F, 3). Vertices and attributes must be written again before the next rendering."""
         if faces is not self.faces:
             self.faces, self.faces_changed = faces, True
 
