@@ -68,7 +68,7 @@ def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndar
 def subdivide(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Subdivide every triangle of a mesh into four. Returns the new arrays (s, uv, faces, *more) in this order.
+    """Subdivide every triangle of a mesh into four. Returns the new arrays (s, uv, faces, more…) in this order.
 
     `s` (V, 3): vertices, points of the domain. `uv` (V, 2): texture coordinates. `faces` (F, 3): triangles. `more`:
     other arrays (V, n) with values of the vertices. New vertices are projected onto the domain; their `uv` and `more`

@@ -107,9 +107,9 @@ class VoxelGrid:
     def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
         """Find the object by a vote of the masks: the largest connected component of voxels that most masks contain.
 
-        `masks`: one per view of the grid, (H, W), above 0 inside. `agreement`: share of the masks that must contain a
-        voxel, of those whose views show it. `voters`: for each mask, whether it votes; None: all vote. Returns None if
-        the component has too few voxels.
+        `masks`: one per view of the grid, (H, W), above 0 inside. `agreement`: a share, 0 to 1. Of the masks whose
+        views show a voxel, this share must contain it. `voters`: for each mask, whether it votes; None: all vote.
+        Returns None if the component has too few voxels.
         """
         yes, shown = np.zeros((2, len(self.points)), np.int16)
 

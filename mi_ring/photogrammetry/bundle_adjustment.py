@@ -67,7 +67,7 @@ def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections)
 def robust_adjustment(model: Any) -> Iterator[None]:
     """Bundle-adjust a COLMAP model with a robust loss, and remove outliers. `model` is changed.
 
-    An iterator for a progress bar: it yields None before each call of the solver, and the caller must exhaust it.
+    It is an iterator for a progress bar: it yields None before each call of the solver, and the caller must exhaust it.
     """
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
@@ -92,8 +92,8 @@ def adjustment_problem(model: Any) -> tuple[Any, Any]:
 def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
     """Call COLMAP's solver until it converges, at most `calls` times. `model` is changed.
 
-    An iterator for a progress bar: it yields None before each call, and the caller must exhaust it. `options`,
-    `config`: of the bundle adjustment.
+    It is an iterator for a progress bar: it yields None before each call, and the caller must exhaust it. `options`,
+    `config`: COLMAP's objects for the bundle adjustment.
     """
     for _ in range(calls):
         yield
@@ -103,10 +103,10 @@ def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
 
 
 def refine_principal_points(model: Any, progress: Progress) -> Any:
-    """Refine the principal points of a COLMAP model by bundle adjustment. Returns the refined model; `model` stays.
+    """Refine the principal points of a COLMAP model by bundle adjustment. Returns the refined model.
 
-    If the data do not determine the principal point of a camera well, this point keeps its value. Returns `model`
-    itself if this is so for all cameras.
+    `model` does not change. If the data do not determine the principal point of a camera well, this point keeps its
+    value. Returns `model` itself if this is so for all cameras.
     """
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
     fixed: set[int] = set()

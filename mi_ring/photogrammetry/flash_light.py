@@ -122,10 +122,10 @@ def calibrate_flash(
     """Calibrate the flash from the brightness of white paper. Returns None if no photograph shows the paper.
 
     The dictionaries have names of photographs as keys. `papers`: samples of the paper. `poses`: camera-to-world (4, 4),
-    in the sheet's frame [mm]. `axes` (3, 3): from the axes of `offset` to the pixel axes of the photograph.
+    in the sheet's frame [mm]. `axes`: rotations (3, 3) from the axes of `offset` to the pixel axes of the photograph.
     `exposures`: relative exposures, NaN if unknown. `offset` (3,): approximate position of the flash relative to the
-    lens [mm]. `sphere`: stands for the object; None: no object. `curved`: also estimate the camera's response; False:
-    it is linear.
+    lens [mm]. `sphere`: stands for the object; None: no object. `curved`: True: also estimate the camera's response;
+    False: it is linear.
 
     The method is robust least squares of log brightness, with priors. It estimates what all photographs share, and the
     intensity of each photograph. Samples in the margin are used only if they are as bright as the squares. If the

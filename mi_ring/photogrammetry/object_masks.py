@@ -80,7 +80,7 @@ class SegmentationInput(NamedTuple):
 def find_object(
     pictures: Sequence[Picture], sparse: SparseModel, known: SegmentationInput, folder: Path, progress: Progress
 ) -> SegmentedObject:
-    """Find the object, and write its mask in all photographs that have a camera into `folder`.
+    """Find the object in the photographs that have a camera, and write its masks into `folder`.
 
     `sparse`: cameras and points. `known`: what is known about the object. If `folder` has masks already, these are
     used, because the user may have edited them. Raises InputError if they were made with other cameras or another

@@ -215,7 +215,7 @@ def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> li
 
 
 def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return how far n matches are from the epipolar lines of two images' poses: their Sampson distances (n,) [px].
+    """Return the Sampson distances (n,) [px] of n matches from the epipolar lines that two images' poses give.
 
     `a`, `b`: images of `model` with poses. `first`, `second` (n, 2): the points of the matches in `a` and in `b` [px].
     """

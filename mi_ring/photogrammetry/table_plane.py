@@ -52,7 +52,7 @@ class Plane(NamedTuple):
 
 
 def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half_size: float) -> Plane | None:
-    """Find the table: the plane that contains most of the points around the object, by RANSAC.
+    """Find the table: the plane with the most points around the object, by RANSAC.
 
     `points` (N, 3): sparse points. `cameras` (K, 3): positions of the cameras, which must be above the plane. `center`
     (3,): middle of the object. `half_size`: points up to twice this distance from `center` are used. Returns None if no
