@@ -35,7 +35,8 @@ class NamedPhotographs(Source):
     def posed(self) -> Iterator[Frame]:
         """Read the camera file, and yield the photographs that have a pose. Subclasses implement it.
 
-        An implementation finds each image file by `photograph`, and stores the path in the camera file in `Frame.said`.
+        An implementation finds each image file by `photograph`. It sets `Frame.said` to the path that the camera file
+        gives.
         """
         raise NotImplementedError
 
@@ -54,13 +55,19 @@ class NamedPhotographs(Source):
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs: that of --images, or a folder images near the camera file, or `beside`."""
+        """Folder of the photographs: that of --images, or a folder images near the camera file.
+
+        Without both, it is the folder of the camera file.
+        """
         candidates = (self.beside / "images", self.beside.parent / "images")
         return self.images or next((folder for folder in candidates if folder.is_dir()), self.beside)
 
     @cached_property
     def photograph_files(self) -> PhotographFiles:
-        """Index of the image files that may be photographs: `photographs` if set, otherwise all below `folder`."""
+        """Index of the image files that may be photographs.
+
+        These are `photographs`, or if that is None, all image files in and below the folder of the photographs.
+        """
         if self.photographs is not None:
             return PhotographFiles(self.photographs, self.photographs[0].parent if self.photographs else Path())
         return PhotographFiles(images_below(self.folder), self.folder)

@@ -54,7 +54,7 @@ class PhotographFiles:
 
     @property
     def ordinary(self) -> list[Path]:
-        """The files without those in folders that have no photographs, which have names such as masks or depth."""
+        """All files except those in folders such as masks or depth, whose images are no photographs."""
         return [file for file in self.files if not ASIDE.intersection(self.folders[file][self.below :])]
 
     def find(self, path: str) -> tuple[Path | None, bool]:

@@ -52,9 +52,10 @@ def has_fast_bfloat16(device: torch.device) -> bool:
 
 
 def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.AbstractContextManager]:
-    """Return a function without arguments that makes a context manager. In it, torch uses this precision for products.
+    """Return a function that makes a context manager in which torch computes matrix products in this precision.
 
-    `precision`: "float32", "bfloat16", or "auto" for the faster one of both on `device`.
+    `precision`: "float32", "bfloat16", or "auto" for the faster one of both on `device`. The function takes no
+    arguments.
     """
     if precision == "bfloat16" or (precision == "auto" and has_fast_bfloat16(device)):
         return lambda: torch.autocast(device.type, torch.bfloat16)
