@@ -239,10 +239,11 @@ def up_directions(pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
 
 
 def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
-    """List the photographs in a folder, sorted by name. A raw file replaces a JPEG of the same name.
+    """List the photographs in a folder, sorted by name.
 
-    `upright`: turn pixels by the EXIF orientation. Raises InputError if the folder is missing, if a file name cannot be
-    used, if there are too few photographs, or if two of them are the same.
+    Of a raw file and a JPEG of the same name, only the raw file is listed. `upright`: turn pixels by the EXIF
+    orientation. Raises InputError if the folder is missing, if a file name cannot be used, if there are too few
+    photographs, or if two of them are the same.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: FOLDER: {'is a file' if folder.exists() else 'no such folder'}; give the folder "

@@ -145,11 +145,11 @@ class CookTorrance(mi.BSDF):
     def lobes(self, si, order, active=True):
         """Compute how the surface reflects light that is given by spherical harmonics. Returns two lobes.
 
-        The lobes are diffuse and specular, each symmetric about an axis. A lobe is a pair: (its axis, a unit vector in
-        the world, list of `order` + 1 factors). Factor l multiplies the light's harmonics of degree l, evaluated at the
-        axis; the sum over l is the reflected radiance. The diffuse lobe is that of "An Efficient Representation for
-        Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The specular lobe is an approximation, tabulated
-        over roughness and viewing angle.
+        The first lobe is diffuse, the second specular. A lobe is a pair (axis, factors). The axis is a unit vector in
+        the world, about which the lobe is symmetric. Factor l of the `order` + 1 factors multiplies the light's
+        harmonics of degree l, evaluated at the axis; the sum over l is the reflected radiance. The diffuse lobe is that
+        of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The specular
+        lobe is an approximation, tabulated over roughness and viewing angle.
         """
         diffuse, specular, r = self.parameters(si, active)
         active &= self.front(si, mi.Vector3f(0, 0, 1))

@@ -22,9 +22,9 @@ FRAMES = {"world": [*range(PER_FRAME)], "camera": [0, *range(PER_FRAME, BASIS)]}
 
 
 def harmonics_up_to(order: int, frames: Iterable[str]) -> list[int]:
-    """List the indices of the harmonics up to degree `order` in these axes, sorted.
+    """List the indices of the harmonics up to degree `order`, sorted.
 
-    `frames`: "world", "camera" or both.
+    `frames`: the axes whose harmonics are listed: "world", "camera" or both.
     """
     return sorted({k for frame in frames for k in FRAMES[frame][: (order + 1) ** 2]})
 

@@ -88,7 +88,7 @@ class Studio:
 
     @property
     def ground(self) -> np.ndarray:
-        """Point (3,) of the table: on the vertical axis through the origin, at the height of the lowest vertex."""
+        """Point (3,) of the table on the vertical axis through the origin, as low as the object's lowest vertex."""
         return self.config.up_axis * (self.mesh.vertices @ self.config.up_axis).min()
 
     def photographs(self, count: int, novel: bool = False) -> list[PlannedPhotograph]:

@@ -35,7 +35,7 @@ def device() -> torch.device:
 def has_fast_bfloat16(device: torch.device) -> bool:
     """Return True if matrix products are faster in bfloat16 than in float32. Most processors only emulate bfloat16.
 
-    It is decided by the features of the processor. Nothing is measured, so that a fit can be repeated exactly.
+    The features of the processor decide this. Nothing is measured, so that a fit can be repeated exactly.
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
