@@ -43,7 +43,7 @@ class Sign(NamedTuple):
 
 
 def has(*fields: str) -> Callable[[Path], bool]:
-    """Make a test of a path. It returns True if the file is a JSON object in which one of `fields` is not empty."""
+    """Make a function of a path: it returns whether the file is a JSON object in which one of `fields` is not empty."""
     return lambda path: isinstance(top := load_json(path), dict) and any(top.get(field) for field in fields)
 
 

@@ -47,7 +47,7 @@ class Picture:
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """Pixels (H, W, C) uint8 or uint16, encoded as `encoding` says, turned upright if `upright` is True.
+        """Pixels (H, W, C) uint8 or uint16. They are turned upright if `upright` is set. See also `encoding`.
 
         Floats become uint16: 1 is full scale, and larger values are clipped. Raises InputError if the file cannot be
         read.
