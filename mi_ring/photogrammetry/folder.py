@@ -68,7 +68,7 @@ class Picture:
 
     @property
     def mask_pixels(self) -> np.ndarray:
-        """The file read as a mask: (H, W) uint8, turned in the same way as `pixels`."""
+        """The file, read as a mask (H, W) uint8. It is turned in the same way as `pixels`."""
         return oriented(mask_values(read_as(self.path, "mask", read_image)), self.orientation)
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
