@@ -1,4 +1,4 @@
-"""The Mitsuba plugins. The file of a plugin has the plugin's name.
+"""The Mitsuba plugins, one file per plugin with the plugin's name.
 
 May import: mitsuba, drjit, numpy, torch; rendering, objects, scene, geometry.
 """
