@@ -138,8 +138,8 @@ class Shot:
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Shot":
         """Return a copy with camera and light in another frame: a point x becomes scale · rotation · x + shift.
 
-        `rotation` (3, 3), `shift` (3,). The intensity of a point light is multiplied by `scale`² so that irradiances
-        stay the same.
+        `rotation` (3, 3), `shift` (3,). The intensity of a point light is multiplied by the square of `scale`, so that
+        irradiances stay the same.
         """
         light = self.own_light
         if light.kind == "point":  # scaled so that irradiance does not change
