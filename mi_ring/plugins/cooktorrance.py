@@ -30,8 +30,8 @@ class CookTorrance(mi.BSDF):
     ``roughness``    float or texture  r, the width α of the distribution, at least 0.02. Default: the   P, ∂
                                        mesh attribute ``vertex_roughness``
     ``distribution`` string            D and its G: ``ggx`` or ``beckmann``. Default: ``ggx``
-    ``fresnel``      boolean           true: the surface reflects more at grazing angles. Default: false,
-                                       as in the paper
+    ``fresnel``      boolean           true: it reflects more at grazing angles. Default: false, as in
+                                       the paper
     ================ ================= ================================================================= =====
 
     The paper does not name D and G. Here they are those of Walter et al. 2007 (Microfacet Models for Refraction through
