@@ -1,4 +1,4 @@
-"""Bundler's cameras, which other programs write too."""
+"""Importer of Bundler's cameras. Other programs write this format, too."""
 
 import re
 from collections.abc import Iterator
@@ -64,7 +64,11 @@ class Bundler(Photogrammetry):
 
 
 def read_cameras(path: Path) -> np.ndarray:
-    """Read the cameras (N, 5, 3) of a bundle file. The five rows of a camera: (f, k1, k2), the three rows of R, t."""
+    """Read the cameras of a bundle file. Returns (N, 5, 3): for each camera, five rows of three numbers.
+
+    The rows are (f [px], k1, k2), the three rows of the rotation R, and the translation t, world-to-camera. Raises
+    InputError if the file is damaged.
+    """
 
     def read(file: Path) -> tuple[list[str], list[str]]:
         with file.open(encoding="utf-8-sig") as text:
@@ -77,7 +81,7 @@ def read_cameras(path: Path) -> np.ndarray:
 
 
 def count_in(head: list[str], path: Path) -> int:
-    """Return the number of cameras that a bundle file gives in its first two lines, `head`.
+    """Return the number of cameras that a bundle file announces. `head`: its first two lines.
 
     Raises InputError if these lines are invalid. The message begins with `path`.
     """

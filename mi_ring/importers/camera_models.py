@@ -22,7 +22,7 @@ MAX_SIDE = 10**6  #: of a photograph [px]
 class Lens:
     """The intrinsics of a camera, in one of COLMAP's camera models: https://colmap.github.io/cameras.html
 
-    Raises InputError for a panorama, and for a side of the photograph outside 1 to `MAX_SIDE` pixels.
+    Raises InputError for a panorama, and if width or height is not 1 to `MAX_SIDE` pixels.
     """
 
     model: str  #: COLMAP's name
@@ -60,9 +60,9 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if the lens has no distortion.
+        """True if the lens has no distortion, as its projection of some rays shows.
 
-        It compares rays, because a fisheye lens is no pinhole even if all its coefficients are 0.
+        So a fisheye lens is no pinhole even if all its coefficients are 0.
         """
         if self.model == "PINHOLE":
             return True
@@ -70,7 +70,7 @@ class Lens:
         return np.allclose(self.colmap.img_from_cam(rays), rays[:, :2] * self.focal + self.centre, atol=1e-6)
 
     def scaled(self, size: tuple[int, int]) -> "Lens":
-        """Return the lens for the same photographs, resized to `size` (width, height) [px]."""
+        """Return the lens for photographs that were resized to `size` (width, height) [px]."""
         if self.model == "PINHOLE":
             return Lens("PINHOLE", size, tuple(np.tile(np.divide(size, self.size), 2) * self.params))
         camera = self.colmap  # cached: a copy is changed
@@ -79,18 +79,18 @@ class Lens:
         return Lens(self.model, size, tuple(camera.params))
 
     def camera(self, pose: np.ndarray) -> Camera:
-        """Return the camera of the undistorted photograph, which is a pinhole with the same intrinsics.
+        """Return the pinhole camera of the undistorted photograph: same size, focal lengths and principal point.
 
-        `pose` (4, 4): camera-to-world, with OpenCV's camera axes.
+        `pose` (4, 4): camera-to-world, with OpenCV's camera axes (x right, y down, z forward).
         """
         return Camera(pose @ MITSUBA, np.array(self.focal), np.array(self.centre), self.size)
 
 
 def pinhole_lens(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, what: str) -> Lens:
-    """Make a lens without distortion. `K` (3, 3): calibration matrix. `size`: (width, height) [px].
+    """Make a lens without distortion from a calibration matrix `K` (3, 3) [px].
 
-    `shift` [px] is added to cx and cy. It is 0.5 if the other tool puts the centre of the first pixel at 0. Raises
-    InputError if `K` has skew, or if K[2, 2] is 0. The message begins with `what`.
+    `size`: (width, height) [px]. `shift`: added to cx and cy [px]; 0.5 if the other tool puts the centre of the first
+    pixel at 0, otherwise 0. Raises InputError if `K` has skew, or if K[2, 2] is 0. The message begins with `what`.
     """
     if not K[2, 2]:
         raise InputError(f"{what}: is no calibration matrix (K[2][2] is 0)")
@@ -102,9 +102,10 @@ def pinhole_lens(K: np.ndarray, size: Sequence[int] | np.ndarray, shift: float, 
 
 
 def opencv_lens(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: Sequence[float]) -> Lens:
-    """Make a lens with OpenCV's distortion model: radial `k` = (k1, k2, k3), tangential `p` = (p1, p2).
+    """Make a lens with OpenCV's distortion model; a pinhole if all coefficients are 0.
 
-    `size`: (width, height) [px]. `intrinsics`: fx, fy, cx, cy [px].
+    `size`: (width, height) [px]. `intrinsics`: fx, fy, cx, cy [px]. `k`: radial coefficients k1, k2, k3. `p`:
+    tangential coefficients p1, p2.
     """
     if not any((*k, *p)):
         return Lens("PINHOLE", (size[0], size[1]), tuple(intrinsics))
@@ -112,14 +113,14 @@ def opencv_lens(size: Any, intrinsics: Sequence[float], k: Sequence[float], p: S
 
 
 def pose_of(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4) with the rotation R (3, 3) and the translation t (3,)."""
+    """Return the matrix (4, 4) of the rotation R (3, 3) followed by the translation t (3,)."""
     return np.block([[R, np.reshape(t, (3, 1))], [np.eye(4)[3:]]])
 
 
 def rotation_of(quaternion: object, what: str) -> np.ndarray:
-    """Convert a unit quaternion (x, y, z, w) to a rotation matrix (3, 3).
+    """Convert a unit quaternion (x, y, z, w) that was read from a file to a rotation matrix (3, 3).
 
-    Raises InputError if the quaternion's length is not 1. The message begins with `what`.
+    Raises InputError if it is not four numbers, or if its length is not 1. The message begins with `what`.
     """
     numbers = matrix(quaternion, (4,), what)
     if abs(length := np.linalg.norm(numbers) - 1) > 1e-2:
@@ -128,7 +129,7 @@ def rotation_of(quaternion: object, what: str) -> np.ndarray:
 
 
 def camera_to_world(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the camera-to-world pose (4, 4) for the extrinsics R (3, 3), t (3,): x_camera = R x_world + t."""
+    """Invert extrinsics. Returns the camera-to-world pose (4, 4) for x_camera = R x_world + t, R (3, 3), t (3,)."""
     return pose_of(R.T, -R.T @ t)
 
 

@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, text or binary."""
+"""Importer of COLMAP's sparse models, text or binary."""
 
 import re
 from collections.abc import Iterator
@@ -46,10 +46,10 @@ class Colmap(Photogrammetry):
 
     @staticmethod
     def models(src: Path) -> list[Path]:
-        """List the folders of models in or below the folder `src`.
+        """List the folders of COLMAP models in or below the folder `src`, sorted; empty if there are none.
 
         A model is in `src` itself, in its folder sparse or in a folder inside sparse, in a folder inside colmap/sparse,
-        or in a folder inside `src`. The first of these places that has a model is used.
+        or in a folder inside `src`. Only the models of the first of these places that has any are listed.
         """
         sparse = src / "sparse"
         places = [src], [sparse, *sparse.glob("*")], (src / "colmap/sparse").glob("*"), src.glob("*")
@@ -57,7 +57,7 @@ class Colmap(Photogrammetry):
 
     @classmethod
     def model(cls, src: Path) -> Path | None:
-        """Return the folder of `models` that has the most photographs. None if there is no model."""
+        """Return the folder of the COLMAP model in or below `src` with the most photographs; None without a model."""
         return max(cls.models(src), key=count_images, default=None)
 
     @property
@@ -108,14 +108,14 @@ class Colmap(Photogrammetry):
 
 
 def is_model(folder: Path) -> bool:
-    """Return whether a folder contains a COLMAP model, that is, images.bin or images.txt."""
+    """Return True if a folder contains a COLMAP model, that is, images.bin or images.txt."""
     return any((folder / name).is_file() for name in ("images.bin", "images.txt"))
 
 
 def camera_lines(path: Path) -> Iterator[tuple[bytes, int, list[bytes]]]:
-    """Yield for each camera in images.txt: its line, and (line number, words) of its line of 2-D points.
+    """Yield (line of the camera, number of the next line, words of the next line) for each camera in images.txt.
 
-    In this file, two lines describe a camera. The line of 2-D points is the second.
+    In this file, two lines describe a camera. The second has the image points.
     """
     lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
     for number, line in lines:
@@ -124,13 +124,16 @@ def camera_lines(path: Path) -> Iterator[tuple[bytes, int, list[bytes]]]:
 
 
 def names_in(path: Path) -> dict[int, str]:
-    """Read the photographs' names in images.txt, by IMAGE_ID. COLMAP itself reads a name up to its first space only."""
+    """Read the names of the photographs in images.txt, by IMAGE_ID. Names may contain spaces.
+
+    COLMAP itself reads a name only up to its first space.
+    """
     words = (line.split(maxsplit=9) for line, _, _ in camera_lines(path))
     return {int(own[0]): own[9].decode().rstrip() for own in words if len(own) == 10}
 
 
 def count_images(folder: Path) -> int:
-    """Return the number of photographs of the COLMAP model in `folder`. It reads the images file."""
+    """Read how many photographs the COLMAP model in `folder` has, from its file images.bin or images.txt."""
     binary = folder / "images.bin"
     if binary.is_file():
         with binary.open("rb") as file:
@@ -139,10 +142,9 @@ def count_images(folder: Path) -> int:
 
 
 def require_points(folder: Path) -> None:
-    """Raise InputError if a camera in images.txt has no line of 2-D points after it. This line may be empty.
+    """Raise InputError if a camera in images.txt has no second line, which has its image points and may be empty.
 
-    Without this line, COLMAP would read the next camera as points, and that camera would be lost. Binary models are not
-    checked.
+    COLMAP would otherwise read the next camera as points and lose it. Binary models are not checked.
     """
     if (folder / "images.bin").is_file():
         return

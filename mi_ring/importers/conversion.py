@@ -26,9 +26,10 @@ UNREAD = {
 
 
 def write_scene(source: Source) -> list[Frame]:
-    """Write the scene file `source.scene`, and new files of those images that must change. Returns the frames.
+    """Read a capture of another tool, and write the scene file `source.scene` for it. Returns the imported frames.
 
-    If the input is invalid, it raises InputError and leaves no new files.
+    Images that must change, for example because of lens distortion, are written as new files. If the input is invalid,
+    raises InputError and leaves no new files.
     """
     frames = frames_of(source)
     require_most(source, frames)
@@ -66,7 +67,10 @@ def write_scene(source: Source) -> list[Frame]:
 
 
 def require_most(source: Source, frames: Sequence[Frame]) -> None:
-    """Raise InputError if no photograph has a pose, or if more than half of the cameras have no photograph."""
+    """Raise InputError if no photograph has a pose, or if more than half of the cameras have no photograph.
+
+    `frames`: the photographs that have both.
+    """
     if source.without_pose and not frames and not source.without_photograph:
         raise InputError(f"{source.src}: SRC: none of {len(source.without_pose)} photographs has a pose")
     if (lost := len(source.without_photograph)) > len(frames):
@@ -76,9 +80,9 @@ def require_most(source: Source, frames: Sequence[Frame]) -> None:
 
 
 def unread(source: Source) -> str:
-    """Return a clause for an error message. It names file formats of missing photographs that mi_ring cannot read.
+    """Return a clause for an error message that names formats which mi_ring cannot read; empty if there are none.
 
-    The function looks in `source.folder` for files with the names of missing photographs. Returns "" if there are none.
+    These are the formats of files in `source.folder` that have the names of missing photographs.
     """
     stems = {stem_of(parts_of(name)[-1]) for name in source.without_photograph if parts_of(name)}
     found = (file for file in source.folder.rglob("[!.]*") if stem_of(file.name.lower()) in stems)
@@ -87,7 +91,7 @@ def unread(source: Source) -> str:
 
 
 def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
-    """Return clauses that tell the user what the scene file assumes: encoding, lens distortion, lights, exposures."""
+    """Return clauses that tell the user what the scene file assumes: encoding, lens distortion and lights."""
     given = [source.encoding if source.encoding != "auto" else frame.encoding for frame in frames]
     files = [frame.image for frame, encoding in zip(frames, given) if encoding == "auto" and frame.pixels is None]
     found = encodings(files)
@@ -104,7 +108,7 @@ def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
 
 
 def unused_in(files: Iterable[Path]) -> list[str]:
-    """Return sentences about metadata fields of the image files that mi_ring does not use.
+    """Return sentences about metadata fields in image files that mi_ring does not use although they may matter.
 
     There is one sentence for each field, and at most five: those of the most frequent fields.
     """
@@ -113,7 +117,10 @@ def unused_in(files: Iterable[Path]) -> list[str]:
 
 
 def report(source: Source, frames: Sequence[Frame]) -> str:
-    """Return the text of the report: what was left out and why, what was used, what was assumed. It prints nothing."""
+    """Return a report for the user: what was left out and why, what was used, what was assumed. Prints nothing.
+
+    `frames`: what was imported from `source`.
+    """
     lines = list(source.notes)
     total = len(frames) + len(source.without_pose)
     if source.without_pose:

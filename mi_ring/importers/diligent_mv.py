@@ -1,4 +1,4 @@
-"""DiLiGenT-MV's objects."""
+"""Importer of objects of the data set DiLiGenT-MV."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -79,6 +79,6 @@ class DiligentMV(Source):
 
     @property
     def truth(self) -> Path | None:
-        """Path of the ground-truth mesh, or None if SRC has none."""
+        """Path of the ground-truth mesh; None if the folder has none."""
         mesh = self.src / "mesh_Gt.ply"
         return mesh if mesh.is_file() else None

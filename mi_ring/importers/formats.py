@@ -1,4 +1,4 @@
-"""All formats, by the names that `mi_ring.convert` uses, and functions that recognise the format of a file."""
+"""All formats by the names that `mi_ring.convert` uses, and functions that recognise the format of a file."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -34,7 +34,7 @@ FORMATS: dict[str, type[Source]] = {
 
 
 class Sign(NamedTuple):
-    """How to recognise the camera files of a format."""
+    """A sign by which camera files of a format are recognised."""
 
     format: str  #: its name
     what: str  #: for the user
@@ -48,25 +48,25 @@ def has(*fields: str) -> Callable[[Path], bool]:
 
 
 def has_files(*names: str) -> Callable[[Path], bool]:
-    """Make a function of a path: it returns whether this folder contains at least one of the files `names`."""
+    """Make a test of a folder. It returns True if the folder contains at least one of the files `names`."""
     return lambda path: any((path / name).is_file() for name in names)
 
 
 def has_sidecars(folder: Path) -> bool:
-    """Test whether a folder contains an XMP sidecar with a camera pose."""
+    """Return True if a folder contains an XMP sidecar with a camera pose."""
     return any(
         accepts(lambda path: "Rotation" in xmp_fields(load_xml(path)), file) for file in sidecars_in(folder).values()
     )
 
 
 def has_keyframes(folder: Path) -> bool:
-    """Return whether a folder, or its subfolder `keyframes`, contains Polycam cameras."""
+    """Return True if a folder, or its subfolder keyframes, contains Polycam's cameras."""
     cameras = (next(place.glob("*cameras/[!.]*.json"), None) for place in (folder, folder / "keyframes"))
     return any(isinstance(own := load_json(path), dict) and "t_00" in own for path in cameras if path)
 
 
 def begins(path: Path, word: bytes) -> bool:
-    """Return whether the first bytes of a file, after a byte order mark of UTF-8, are `word`."""
+    """Return True if a file begins with the bytes `word`, or with a byte order mark of UTF-8 and `word`."""
     with path.open("rb") as file:
         return file.read(3 + len(word)).removeprefix(b"\xef\xbb\xbf").startswith(word)
 
@@ -99,7 +99,7 @@ SIGNS = (
 
 
 def signs_in(place: Path) -> Iterator[tuple[str, Path]]:
-    """Yield (format name, SRC path) for each camera file found in `place`, which is a folder or one file."""
+    """Yield (format name, SRC path) for each camera file that is recognised. `place`: a folder, or one file."""
     for sign in SIGNS:
         if not place.is_dir():
             paths = [place] if place.suffix.lower() in {Path(name).suffix for name in sign.files} else []
@@ -111,11 +111,11 @@ def signs_in(place: Path) -> Iterator[tuple[str, Path]]:
 
 
 def detect(folder: Path) -> Source | None:
-    """Find camera files in a folder of photographs. If there are none, look in its parent folder.
+    """Find camera files in a folder of photographs, or if there are none, in its parent folder.
 
-    Returns an importer for the camera files, or None if there are none. If several formats match, the first in `SIGNS`
-    is used. If several files match, the first by name is used. Formats that need special photographs are ignored. The
-    importer looks for photographs in `folder` if that contains images. Only transforms.json says itself where they are.
+    Returns an importer for them, or None. If several formats match, the first of `SIGNS` is used; if several files
+    match, the first by name. Formats that need special photographs are ignored. The importer looks for photographs in
+    `folder` if that contains images, except for transforms.json, which itself says where they are.
     """
     images = folder if list_images(folder) else None
     for place in (folder, folder.absolute().parent):
@@ -131,7 +131,7 @@ def detect(folder: Path) -> Source | None:
 def guess(src: Path) -> tuple[str, Path]:
     """Recognise the format of `src`, a file or folder. Returns (format name, path to give as SRC).
 
-    Raises InputError if no format or several formats match.
+    Raises InputError if no format is recognised, or if several files or formats match.
     """
     found = [*dict.fromkeys(signs_in(src))]
     if len(found) == 1:
@@ -144,7 +144,7 @@ def guess(src: Path) -> tuple[str, Path]:
 
 
 def accepts(check: Callable[[Path], Any], path: Path) -> bool:
-    """Return whether `check(path)` is true. Returns False if the file cannot be read."""
+    """Return True if `check(path)` is true; False if it is false or if the file cannot be read."""
     try:
         return bool(check(path))
     except (InputError, OSError, LookupError):

@@ -1,4 +1,4 @@
-"""Frames, which all importers yield: photographs with their cameras and lights."""
+"""Frames, which all importers produce: photographs with their cameras and lights. Also their checks."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -27,7 +27,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  #: from OpenGL's camera axes (x right,
 
 @dataclass
 class Frame:
-    """A photograph with its camera, light and mask, as an importer read them. Lens distortion is still in it."""
+    """A photograph with its camera, light and mask, as an importer read them, before its distortion is removed."""
 
     image: Path
     lens: Lens
@@ -48,16 +48,16 @@ class Frame:
         return self.lens.camera(self.pose)
 
     def at_camera(self, rgb: ArrayLike, offset: ArrayLike = (0, 0, 0)) -> Light:
-        """Return a point light that is fixed to the camera. `rgb` (3,): its intensity. The frame does not change.
+        """Return a point light that is fixed to the camera of this frame, which does not change.
 
-        `offset` (3,): position of the light relative to the camera: right, down, forward [scene units].
+        `rgb` (3,): its intensity. `offset` (3,): its position relative to the lens: right, down, forward [scene units].
         """
         return Light("point", self.pose[:3, :3] @ np.array(offset, float) + self.pose[:3, 3], np.array(rgb, float))
 
 
 @dataclass(frozen=True)
 class Source:
-    """Base class of all importers. It has the options that all formats share."""
+    """Base class of all importers, with the options that all formats share. An instance is one import."""
 
     fields: ClassVar[Fields]  #: of the format
 
@@ -76,28 +76,29 @@ class Source:
     """The photographs to import; other cameras are ignored. None: all, and each camera must have a photograph."""
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the photographs that have a pose. Raises InputError for invalid data."""
+        """Read the other tool's data, and yield the photographs with a pose. Raises InputError for invalid data."""
         raise NotImplementedError
 
     @cached_property
     def without_pose(self) -> set[str]:
-        """Names of photographs without a pose. The set is complete once `frames` has yielded all photographs."""
+        """Names of photographs without a pose. `frames` fills the set; it is complete at its end."""
         return set()
 
     @cached_property
     def without_photograph(self) -> list[str]:
-        """Names of cameras without a photograph. The list is complete once `frames` has yielded all photographs."""
+        """Names of cameras whose photograph was not found. `frames` fills the list; it is complete at its end."""
         return []
 
     @cached_property
     def notes(self) -> list[str]:
-        """Sentences for the user about choices and unused data. Complete once `frames` has yielded all photographs."""
+        """Sentences for the user about choices and unused data. `frames` fills the list."""
         return []
 
     def tell_unused(self, file: Path, names: Iterable[str]) -> None:
-        """Add a note about fields of `file` that mi_ring does not use although they may matter.
+        """Add a note for the user about fields of `file` that mi_ring does not use although they may matter.
 
-        `names`: all fields of the file. The note does not name fields that are used or harmless.
+        `names`: all fields that the file has. Fields that are used or harmless are not mentioned. Without other fields,
+        no note is added.
         """
         if unused := self.fields.unused(names):
             words = [f"{' '.join(name.split())[:60]} ({why})" for name, why in unused.items()]
@@ -110,12 +111,12 @@ class Source:
 
     @property
     def available(self) -> Sequence[Path]:
-        """Image files that may be photographs. Empty for a format that uses every image it finds."""
+        """Image files that may be photographs, with or without a camera; empty if the format uses every image."""
         return []
 
 
 def frames_of(source: Source) -> list[Frame]:
-    """Return all frames of an importer. Converts any error of the importer to an InputError."""
+    """Read all frames of an importer. Any error in reading becomes an InputError that names the file."""
     try:
         return list(source.frames())
     except InputError:
@@ -126,7 +127,7 @@ def frames_of(source: Source) -> list[Frame]:
 
 
 def is_scaled(size: Sequence[int], original: Sequence[int]) -> bool:
-    """Return whether an image was resized from the size `original` to `size` with equal proportions.
+    """Return True if an image of `original` size was resized to `size` with equal proportions.
 
     Both are (width, height) [px]. Returns False if the sizes differ by less than 5 %.
     """
@@ -135,11 +136,11 @@ def is_scaled(size: Sequence[int], original: Sequence[int]) -> bool:
 
 
 def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
-    """Change a frame's lens so that it fits the image file. `size` (width, height) [px]: size of the file.
+    """Change the lens of a frame so that it fits the size of the image file. Returns what was changed, as a clause.
 
-    If the photograph was resized, the lens is scaled. If the lens is that of the photograph turned upright by its EXIF
-    `orientation`, `frame.orientation` is set. Returns a clause that tells the user what was changed; empty if nothing
-    was. If the proportions of lens and file differ, nothing is changed.
+    `size`: (width, height) of the file [px]. `orientation`: EXIF orientation of the file, 1 to 8. If the photograph was
+    resized, the lens is scaled. If the lens is for the photograph turned upright, the frame's orientation is set, too.
+    If the proportions differ otherwise, nothing changes. The clause is empty if nothing was changed.
     """
     done = ""
     if size != frame.lens.size and orientation > 4 and (
@@ -155,10 +156,11 @@ def adapt(frame: Frame, size: tuple[int, int], orientation: int) -> str:
 
 
 def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
-    """Call `adapt` for all frames. Its messages are added to the notes of `source`.
+    """Change the lenses of all frames so that they fit the sizes of the image files. Adds notes to `source`.
 
-    If the sizes show that some photographs must be turned by their EXIF orientation, all are whose size stays the same:
-    turned by 180 degrees, or square.
+    A photograph whose lens is for the upright picture will be turned by its EXIF orientation. If sizes show that this
+    is so for some photographs, it is also assumed where sizes cannot show it: for 180 degrees and for square
+    photographs.
     """
     files = [frame for frame in frames if frame.pixels is None]
     turns = [orientation_of(frame.image) for frame in files]
@@ -177,9 +179,10 @@ def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
-    """Raise InputError if there are no frames, or if the size of a photograph or mask is not that of its camera.
+    """Raise InputError if there are no frames, or if a frame is invalid.
 
-    It also calls `require_cameras`. `source`: path for the message.
+    A frame is invalid if its pose, lens, light or file name is, or if the size of photograph or mask is not that of the
+    camera. `source`: path of the import, for the message.
     """
     if not frames:
         raise InputError(f"{source}: SRC: found no photographs")

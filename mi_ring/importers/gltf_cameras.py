@@ -1,4 +1,4 @@
-"""Cameras in glTF files, as Blender exports them."""
+"""Importer of cameras in glTF files, as Blender exports them."""
 
 import math
 from collections.abc import Iterator
@@ -70,21 +70,21 @@ class GltfCameras(Photogrammetry):
 
 
 def read_gltf(path: Path) -> pygltflib.GLTF2:
-    """Read a glTF file, but not the buffer files that it names."""
+    """Read a glTF file, without the buffer files that it names. Raises InputError if the file is damaged."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: SRC: must end in {' or '.join(SUFFIXES)}")
     return read_as(path, "glTF", lambda file: pygltflib.GLTF2().load(str(file)))
 
 
 def has_cameras(path: Path) -> bool:
-    """Return whether a glTF file has at least two cameras. A single camera may be that of a viewer."""
+    """Return True if a glTF file has at least two cameras. A single camera may be that of a viewer."""
     return sum(node.camera is not None for node in read_gltf(path).nodes) > 1
 
 
 def entry(things: list, index: object, what: str) -> pygltflib.Property:
-    """Return `things[index]`, where `index` comes from a file.
+    """Return `things[index]`, where `index` was read from a file and may be anything.
 
-    Raises InputError if the index is invalid. The message begins with `what`.
+    Raises InputError if it is no valid index. The message begins with `what`.
     """
     if not isinstance(index, int) or not 0 <= index < len(things):
         raise InputError(f"{what}: is {str(index)[:40]}; there is none of this number")
@@ -92,7 +92,7 @@ def entry(things: list, index: object, what: str) -> pygltflib.Property:
 
 
 def placed_nodes(gltf: pygltflib.GLTF2, path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield (node number, node-to-world transform (4, 4)) for each node.
+    """Yield (node number, node-to-world transform (4, 4)) for each node of a glTF file.
 
     Raises InputError if a node has several parents, or is inside itself. The message begins with `path`.
     """
@@ -111,7 +111,10 @@ def placed_nodes(gltf: pygltflib.GLTF2, path: Path) -> Iterator[tuple[int, np.nd
 
 
 def transform_of(node: pygltflib.Node, what: str) -> np.ndarray:
-    """Return the node-to-parent transform (4, 4): the node's matrix, or else its translation, rotation and scale."""
+    """Return the node-to-parent transform (4, 4) of a node: its matrix, or its translation, rotation and scale.
+
+    Raises InputError if these are invalid. The message begins with `what`.
+    """
     if node.matrix is not None:
         return matrix(node.matrix, (16,), f"{what}.matrix").reshape(4, 4).T
     R = rotation_of(node.rotation or [0, 0, 0, 1], f"{what}.rotation")
@@ -120,10 +123,10 @@ def transform_of(node: pygltflib.Node, what: str) -> np.ndarray:
 
 
 def rigid(place: np.ndarray, what: str) -> np.ndarray:
-    """Return a node-to-world transform (4, 4) without its scale. A camera's picture does not depend on this scale.
+    """Return a node-to-world transform (4, 4) without its scale, as the pose of a camera.
 
-    Raises InputError if the transform shears or mirrors, or if axes have different scales. The message begins with
-    `what`.
+    `place` (4, 4): the transform. Raises InputError if it shears or mirrors, or scales axes differently. The message
+    begins with `what`.
     """
     scale = np.cbrt(np.linalg.det(place[:3, :3]))
     if not scale > 0 or not np.allclose(place[:3, :3].T @ place[:3, :3], scale**2 * np.eye(3), atol=1e-4 * scale**2):
@@ -135,7 +138,7 @@ def rigid(place: np.ndarray, what: str) -> np.ndarray:
 def lens_of(perspective: pygltflib.Perspective, image: Path, what: str) -> Lens:
     """Make the lens of a glTF camera for the photograph `image`, whose size is read from its file.
 
-    The glTF camera gives the vertical field of view [rad] and the aspect ratio. Raises InputError if they are invalid
+    `perspective`: vertical field of view [rad] and aspect ratio of the camera. Raises InputError if these are invalid
     or do not fit the photograph. The message begins with `what`.
     """
     yfov = float(matrix(perspective.yfov, (), f"{what}: yfov"))

@@ -1,4 +1,4 @@
-"""cam_dict_norm.json of IRON."""
+"""Importer of the file cam_dict_norm.json of IRON."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

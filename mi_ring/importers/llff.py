@@ -1,4 +1,4 @@
-"""poses_bounds.npy of LLFF and NeRF."""
+"""Importer of the file poses_bounds.npy of LLFF and NeRF."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Agisoft Metashape's cameras."""
+"""Importer of Agisoft Metashape's cameras."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -112,12 +112,15 @@ class Metashape(Photogrammetry):
 
 
 def chunks_of(root: ElementTree.Element) -> list[ElementTree.Element]:
-    """Return the <chunk> elements of a Metashape XML file. There are none in other kinds of files."""
+    """Return the <chunk> elements of a Metashape XML file, whose root is given; empty for other XML files."""
     return root.findall("chunk") if root.tag == "document" else []
 
 
 def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.Element | None:
-    """Return the child at `path` of the first parent that has one. Returns None if no parent has one."""
+    """Return the first element at `path` in one of the elements `parents`, in their order; None if there is none.
+
+    A parent may be None and is then skipped.
+    """
     children = (parent.find(path) for parent in parents if parent is not None)
     return next((child for child in children if child is not None), None)
 
@@ -125,10 +128,10 @@ def first_child(path: str, *parents: ElementTree.Element | None) -> ElementTree.
 def numbers(
     parent: ElementTree.Element, name: str, shape: tuple[int, ...], what: str, default: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the numbers in the text of `parent`'s child element `name`, as an array of this `shape`.
+    """Read the numbers in the child element `name` of the XML element `parent`. Returns an array of this `shape`.
 
-    If the element is missing, `default` is returned. Raises InputError if the numbers are invalid, or if the element is
-    missing and there is no `default`. The message begins with `what`.
+    `default`: result if the child is missing; None: this is an error. Raises InputError if the numbers are missing or
+    invalid. The message begins with `what`.
     """
     text = parent.findtext(name)
     if text is None and default is not None:
@@ -138,10 +141,10 @@ def numbers(
 
 
 def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.ndarray:
-    """Convert a camera-to-chunk pose (4, 4) to the camera-to-world pose (4, 4).
+    """Convert a camera-to-chunk pose (4, 4) to a camera-to-world pose (4, 4).
 
-    `transform`: the XML element with rotation, translation and scale of the chunk. Each of the three may be missing.
-    Raises InputError if the scale is not positive. The message begins with `what`.
+    `transform`: the XML element with rotation, translation and scale of the chunk. Each of these may be missing. Raises
+    InputError if the scale is not positive. The message begins with `what`.
     """
     rotation = numbers(transform, "rotation", (3, 3), what, np.eye(3))
     shift = numbers(transform, "translation", (3,), what, np.zeros(3))
@@ -152,10 +155,10 @@ def in_world(pose: np.ndarray, transform: ElementTree.Element, what: str) -> np.
 
 
 def in_rig(sensor: ElementTree.Element, master: ElementTree.Element, what: str) -> np.ndarray:
-    """Return the pose (4, 4) of a rig's `sensor` relative to the sensor of the `master` camera.
+    """Return the pose (4, 4) of a camera in a rig, relative to the rig's master camera.
 
-    Raises InputError if the pose is missing, or if it is relative to a different sensor. The message begins with
-    `what`.
+    `sensor`: XML element of the camera's sensor, which has this pose. `master`: XML element of the master camera.
+    Raises InputError if the pose is missing, or if it is relative to another sensor. The message begins with `what`.
     """
     if sensor.get("master_id") != master.get("sensor_id"):
         raise InputError(f"{what}: master_id: is {sensor.get('master_id')!r}, but the master of its camera has sensor "
@@ -164,7 +167,7 @@ def in_rig(sensor: ElementTree.Element, master: ElementTree.Element, what: str) 
 
 
 def lens_of(sensor: ElementTree.Element, what: str) -> Lens:
-    """Make the lens of a <sensor> element. The formulas are in appendix D of Metashape's manual.
+    """Make the lens of a <sensor> element, by the formulas in appendix D of Metashape's manual.
 
     Raises InputError if this kind of lens is not supported. The message begins with `what`.
     """

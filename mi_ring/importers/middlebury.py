@@ -1,4 +1,4 @@
-"""Middlebury's multi-view stereo data."""
+"""Importer of Middlebury's multi-view stereo data."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

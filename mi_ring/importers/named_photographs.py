@@ -1,4 +1,4 @@
-"""Base class of formats in which the camera file names the image file of each photograph."""
+"""Base class of importers whose camera file names the image file of each photograph."""
 
 import os
 import re
@@ -19,7 +19,7 @@ MASK_LIKE = re.compile("mask|segment|matte|alpha", re.IGNORECASE)  #: in the nam
 
 @dataclass(frozen=True)
 class NamedPhotographs(Source):
-    """Base class of formats that name the image file of each photograph. Subclasses implement `posed`."""
+    """Base class of importers whose camera file names the image files. Subclasses implement `posed`."""
 
     names: ClassVar[tuple[str, ...]] = ()  #: of the file of cameras, where SRC is a folder
 
@@ -33,15 +33,16 @@ class NamedPhotographs(Source):
     photo_mask.png among them."""
 
     def posed(self) -> Iterator[Frame]:
-        """Yield the photographs that have a pose.
+        """Read the camera file, and yield the photographs that have a pose. Subclasses implement it.
 
-        An implementation calls `photograph` with a path from the camera file, and stores this path in `Frame.said`.
+        An implementation finds each image file by `photograph`. It sets `Frame.said` to the path that the camera file
+        gives.
         """
         raise NotImplementedError
 
     @property
     def cameras(self) -> Path:
-        """Path of the camera file: SRC itself, or the first of `names` that exists if SRC is a folder.
+        """Path of the camera file: SRC itself, or if SRC is a folder, the first of the usual `names` that exists in it.
 
         Raises InputError if none exists.
         """
@@ -49,18 +50,24 @@ class NamedPhotographs(Source):
 
     @property
     def beside(self) -> Path:
-        """Folder of the camera file. If SRC is a folder and the format has no single camera file, it is SRC itself."""
+        """Folder of the camera file; SRC itself if the format has a folder of camera files."""
         return self.src if self.src.is_dir() and not self.names else self.cameras.parent
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs: `images` if given, else a folder images near the camera file, or `beside`."""
+        """Folder of the photographs: that of --images, or a folder images near the camera file.
+
+        Without both, it is the folder of the camera file.
+        """
         candidates = (self.beside / "images", self.beside.parent / "images")
         return self.images or next((folder for folder in candidates if folder.is_dir()), self.beside)
 
     @cached_property
     def photograph_files(self) -> PhotographFiles:
-        """Index of the files that may be photographs: `photographs` if given, else all images in and below `folder`."""
+        """Index of the image files that may be photographs.
+
+        These are `photographs`, or if that is None, all image files in and below the folder of the photographs.
+        """
         if self.photographs is not None:
             return PhotographFiles(self.photographs, self.photographs[0].parent if self.photographs else Path())
         return PhotographFiles(images_below(self.folder), self.folder)
@@ -70,9 +77,9 @@ class NamedPhotographs(Source):
         return self.photograph_files.ordinary
 
     def photograph(self, path: str, what: str, relative: bool = False) -> Path | None:
-        """Return the image file of the photograph that the camera file calls `path`.
+        """Find the image file of a photograph. `path`: its path in the camera file, perhaps of another computer.
 
-        If no file matches, it returns None and adds `path` to `without_photograph`. `relative`: first try `path`
+        If no file matches, returns None and adds `path` to `without_photograph`. `relative`: True: first try `path`
         relative to the folder of the camera file. Raises InputError if several files match equally well. The message
         begins with `what`.
         """
@@ -87,9 +94,9 @@ class NamedPhotographs(Source):
         return found
 
     def largest(self, models: Sequence[Sized], what: str) -> int:
-        """Return the index of the model with the most photographs. The length of a model is its number of photographs.
+        """Return the index of the longest of several models, whose length is their number of photographs.
 
-        It adds a note that the other models are not used. `what`: the plural noun for models in this note.
+        Adds a note for the user if other models are not used. `what`: the plural noun for models in this note.
         """
         sizes = [len(model) for model in models]
         best = sizes.index(max(sizes))
@@ -99,11 +106,10 @@ class NamedPhotographs(Source):
         return best
 
     def mask_at(self, path: str, image: Path, what: str) -> Path:
-        """Return the mask file of the photograph `image` that the camera file calls `path`.
+        """Find the mask file of the photograph `image`. `path`: the mask's path in the camera file.
 
-        `path` may be relative to the camera file. Otherwise a file of this name is looked for in and below the folder
-        `masks`. Without this option, it is looked for below the folder of the camera file. Raises InputError if there
-        is none. The message begins with `what`.
+        It may be relative to the camera file. Otherwise the file is searched in and below --masks, or the folder of the
+        camera file. Raises InputError if there is none. The message begins with `what`.
         """
         if is_file(file := self.beside / path):
             return file
@@ -126,11 +132,12 @@ class NamedPhotographs(Source):
         yield from frames
 
     def find_masks(self, frames: list[Frame]) -> None:
-        """Find the masks of all frames, and set `mask` of each frame.
+        """Find the masks of all frames, and set the field `mask` of each frame.
 
-        With the option `masks`, they come from this folder. Raises InputError if a photograph has no mask there.
-        Without the option, they come from the alpha channels of the photographs, then from `masks_beside`, and then
-        from files such as photo_mask.png among the photographs. In these cases, a photograph may have no mask.
+        With --masks, they come from this folder; raises InputError if a photograph has no mask there. Without it, they
+        are the alpha channels of the photographs, then files in a folder of masks beside the photographs, then files
+        such as photo_mask.png among the photographs. In these cases, a photograph may have no mask. Adds notes for the
+        user.
         """
         folder, root = self.masks, self.photograph_files.root
         if folder is None:
@@ -173,10 +180,10 @@ class NamedPhotographs(Source):
             self.notes.append(f"{counted(unused, 'mask')} in {folder} of no photograph: {few(unused)}")
 
     def masks_beside(self, root: Path, stem: str) -> Path | None:
-        """Return the folder of masks beside or in `root`, the folder of the photographs. None if there is none.
+        """Return the folder of masks in or beside the folder of the photographs, `root`; None if there is none.
 
-        Its name is one of `MASKS`, or masks_2 beside images_2. It adds a note about other folders that may contain
-        masks: a file in them has a name that begins with `stem`.
+        It has a usual name, such as masks, or masks_2 beside images_2. `stem`: name of a photograph without suffix.
+        Other folders with such a file may contain masks; a note for the user names them.
         """
         around = [place for above in (root.parent, root) for place in sorted(above.glob("[!.]*"))]
         places = [place for place in around if place.is_dir() and place != root]
@@ -189,11 +196,11 @@ class NamedPhotographs(Source):
 
 
 def counted(things: Sized, word: str) -> str:
-    """Return, for example, "1 mask" or "3 masks": the length of `things`, and the noun. `word`: the noun's singular."""
+    """Return the number of `things` with a noun, for example "1 mask" or "3 masks". `word`: the noun in singular."""
     return f"{len(things)} {word}{'s' * (len(things) != 1)}"
 
 
 def few(names: Iterable[str]) -> str:
-    """Return the first three file names in alphabetical order, as one text for a message. Folders are left out."""
+    """Return the first three file names in alphabetical order, as a text for a message, without their folders."""
     some = sorted({" ".join(name_of(name).split())[:99] for name in names})
     return ", ".join(some[:3]) + (", …" if len(some) > 3 else "")

@@ -1,4 +1,4 @@
-"""cameras_sphere.npz of IDR, NeuS and WildLight."""
+"""Importer of the file cameras_sphere.npz of IDR, NeuS and WildLight."""
 
 import re
 from collections.abc import Iterator
@@ -83,9 +83,10 @@ class Neus(Source):
             yield frame
 
     def masks(self, images: dict[int, Path]) -> dict[int, Path]:
-        """Find the masks of the photographs `images`, by their numbers; empty without masks.
+        """Find the masks of photographs. Returns paths by the photograph's number; empty if there are no masks.
 
-        Masks have the names of the photographs, or other names and the same order. Raises InputError if one is missing.
+        `images`: the photographs by number. Masks have the names of the photographs, or other names in the same order.
+        Raises InputError if only some photographs have a mask.
         """
         folder = next((place for name in MASKS if (place := self.src / name).is_dir()), self.src / "mask")
         files = numbered_images(folder)

@@ -1,4 +1,4 @@
-"""OpenSfM's reconstructions, which OpenDroneMap writes too."""
+"""Importer of OpenSfM's reconstructions. OpenDroneMap writes this format, too."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -77,10 +77,10 @@ class OpenSfm(Photogrammetry):
 
 
 def opensfm_lens(given: dict[str, Any], image: Path, what: str) -> Lens:
-    """Make the lens of an OpenSfM camera. `given`: its JSON fields. `image`: a photograph that it took.
+    """Make the lens of an OpenSfM camera. `given`: the JSON object of the camera.
 
-    OpenSfM divides lengths by the longer side of the photograph. It measures positions from the photograph's centre.
-    Raises InputError if the fields are invalid. The message begins with `what`.
+    `image`: a photograph that it took, for the size. OpenSfM divides lengths by the longer side of the photograph, and
+    measures positions from its centre. Raises InputError if a field is invalid. The message begins with `what`.
     """
 
     def number(name: str, default: float | None = None) -> float:

@@ -1,4 +1,4 @@
-"""Base class of photogrammetry formats: ordinary photographs, taken with a light that is fixed to the camera."""
+"""Base class of importers from photogrammetry: ordinary photographs with a light that is fixed to the camera."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.
 
 @dataclass(frozen=True)
 class Photogrammetry(NamedPhotographs):
-    """Base class of the photogrammetry formats. Subclasses implement `posed`.
+    """Base class of importers from photogrammetry. Subclasses implement `posed`.
 
     The light is fixed to the camera. Its intensity follows the exposure of each photograph.
     """
@@ -41,9 +41,9 @@ class Photogrammetry(NamedPhotographs):
             yield frame
 
     def exposures(self, frames: Sequence[Frame]) -> np.ndarray:
-        """Return the relative exposures (N,) of the frames: those in the EXIF data, divided by their median.
+        """Return the relative exposures (N,) of the frames: exposures from EXIF data, divided by their median.
 
-        All are 1 if no photograph has an exposure in its EXIF data, or with --no-exif. Raises InputError if only some
+        All are 1 with --no-exif, or if no photograph has an exposure in its EXIF data. Raises InputError if only some
         photographs have one.
         """
         ones = np.ones(len(frames))
@@ -61,15 +61,18 @@ class Photogrammetry(NamedPhotographs):
 
 
 def exif_values(path: Path) -> dict[int, Any]:
-    """Read exposure time, ISO and aperture from an image file. Returns a dict from EXIF tags to values."""
+    """Read exposure time [s], ISO and aperture from the EXIF data of an image file. Returns values by EXIF tag.
+
+    Values that the file lacks are left out.
+    """
     exif = read_as(path, "image", exif_of).get_ifd(ExifTags.IFD.Exif)
     return {tag: exif[tag] for tag in EXPOSURE if tag in exif}
 
 
 def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
-    """Return the exposure of each photograph: exposure time · ISO / aperture². It is NaN if it is unknown.
+    """Return the exposure of each photograph: exposure time [s] · ISO / aperture². NaN if it is unknown.
 
-    `photographs`: for each, a dict from EXIF tags to values. A value that all photographs lack, for example the
+    `photographs`: EXIF values by EXIF tag, for each photograph. A value that all photographs lack, for example the
     aperture of an old lens, is taken as 1.
     """
     values = np.array([[positive(exif.get(tag)) for tag in EXPOSURE] for exif in photographs]).reshape(-1, 3)
@@ -83,7 +86,7 @@ def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
 
 
 def positive(value: Any) -> float:
-    """Convert an EXIF value to a float. Returns NaN if the value is not a positive finite number."""
+    """Convert an EXIF value to a float. Returns NaN if it is not a positive finite number."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ArithmeticError, IndexError):

@@ -16,7 +16,7 @@ ASIDE = {*MASKS, "depth", "depths", "normal", "normals", "valid", "sparse"}
 
 
 def parts_of(path: str) -> list[str]:
-    """Split a path into its folders and its file name, in lower case. It works for paths of any operating system.
+    """Split a path of any operating system into its folders and its file name, all in lower case.
 
     A drive letter, `.` and `..` are left out.
     """
@@ -25,7 +25,7 @@ def parts_of(path: str) -> list[str]:
 
 
 def name_of(path: str) -> str:
-    """Return the file name of a path. It works for paths of any operating system."""
+    """Return the file name in a path of any operating system."""
     return re.split(r"[/\\]+", path)[-1]
 
 
@@ -37,8 +37,8 @@ def stem_of(name: str) -> str:
 class PhotographFiles:
     """Index of image files. It finds the file for a path that another tool has written, perhaps on another computer.
 
-    The path and the file may differ in case, suffix, drive and leading folders. If several files have the same name,
-    `find` chooses the file whose folders match the path best.
+    Path and file may differ in case, suffix, drive and leading folders. If several files have the name of the path, the
+    one whose folders match best is found. `root`: folder that contains all `files`.
     """
 
     def __init__(self, files: Iterable[Path], root: Path, affix: re.Pattern[str] | None = None) -> None:
@@ -54,13 +54,13 @@ class PhotographFiles:
 
     @property
     def ordinary(self) -> list[Path]:
-        """The files outside folders of masks, depth maps and the like. Such folders are recognised by their names."""
+        """All files except those in folders such as masks or depth, whose images are no photographs."""
         return [file for file in self.files if not ASIDE.intersection(self.folders[file][self.below :])]
 
     def find(self, path: str) -> tuple[Path | None, bool]:
-        """Find the file for a path. Returns (file, whether its folders below `root` match those of the path).
+        """Find the file for a path. Returns (file or None, True if its folders below `root` match those of the path).
 
-        The file is None if no file matches. Raises InputError if several files match equally well.
+        Raises InputError if several files match equally well.
         """
         if not (parts := parts_of(path)):
             return None, False
@@ -98,11 +98,10 @@ def refuse_twins(
     what: str = "photograph of two cameras",
     advice: str = "give --images, the folder that the paths of the cameras begin in",
 ) -> set[str]:
-    """Decide which path gets a file that several paths claim. Returns the set of paths that get no file.
+    """Decide which path gets a file if several paths match the same file. Returns the set of paths that get none.
 
-    `claims`: tuples (file, path, whether the folders of both match). The path whose folders match gets the file. Raises
-    InputError if this is not exactly one path. The message contains `what`, which says what the file would be, and
-    `advice`.
+    `claims`: tuples (file, path, True if the folders of both match). The path whose folders match gets the file. Raises
+    InputError if this is not exactly one path. `what`: what the file would be, for the message. `advice`: its end.
     """
     by_file: dict[Path, list[tuple[str, bool]]] = defaultdict(list)
     for file, path, agrees in claims:

@@ -1,4 +1,4 @@
-"""Polycam's raw data."""
+"""Importer of Polycam's raw data."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class Polycam(Photogrammetry):
 
     @property
     def corrected(self) -> str:
-        """Prefix of the folder names: `corrected_` if the export has corrected cameras, otherwise empty."""
+        """Prefix of the names of folders: `corrected_` if the export has corrected cameras, otherwise empty."""
         return "corrected_" if (self.keyframes / "corrected_cameras").is_dir() else ""
 
     @property

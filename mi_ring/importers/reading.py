@@ -1,4 +1,4 @@
-"""Readers of other tools' files. Each raises InputError if the file is missing, damaged or of another kind."""
+"""Readers of files of other tools. Each raises InputError if the file is missing, damaged or of another kind."""
 
 import json
 import os
@@ -20,25 +20,32 @@ Key = TypeVar("Key")
 
 
 def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
-    """Call `read(path)` and return its result. Raises InputError if the file is missing or cannot be read as `what`."""
+    """Call `read(path)`, and return its result. Any failure becomes an InputError.
+
+    `what`: kind of file, for the message, for example "image".
+    """
     with reading(path, what):
         return read(existing(path, what))
 
 
 def pixels_of(path: Path, heed: bool = False) -> np.ndarray:
-    """Read the pixels (H, W, C) of an image file. `heed`: convert the colours, as `images.read_image` does."""
+    """Read the pixels (H, W, C) of an image file, uint8, uint16 or float32.
+
+    `heed`: True: convert them by the colour space that the file declares, to sRGB for uint8 and to linear values for
+    other types. False: return them as stored. Raises InputError if the file is damaged.
+    """
     return read_as(path, "image", lambda file: images.read_image(file, heed))
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return the width and height [px] of an image file."""
+    """Return the (width, height) of an image file [px]. Reads no pixels."""
     return read_as(path, "image", image_headers.image_size)
 
 
 def orientation_of(path: Path) -> int:
     """Return the EXIF orientation of an image file, 1 to 8: how its pixels must be turned after reading.
 
-    Returns 1 (not turned) if there is no such EXIF data. Also returns 1 for raw and HEIC files.
+    1 means that they are not turned. It is returned without EXIF data, and for raw and HEIC files.
     """
     if path.suffix.lower() in (*image_headers.HEIF, *image_headers.RAW):  # HEIF's reader has turned them already
         return 1
@@ -47,7 +54,7 @@ def orientation_of(path: Path) -> int:
 
 
 def has_alpha(path: Path) -> bool:
-    """Return whether an image file has an alpha channel in which at least one pixel is not opaque."""
+    """Return True if an image file has an alpha channel with at least one pixel that is not opaque."""
     if not read_as(path, "image", image_headers.has_alpha_channel):
         return False
     pixels = pixels_of(path)
@@ -56,7 +63,7 @@ def has_alpha(path: Path) -> bool:
 
 
 def existing(path: Path, field: str) -> Path:
-    """Return `path` if it is a file. Otherwise raises InputError. In the message, `field` says where `path` is from."""
+    """Return `path` if it is a file, otherwise raise InputError. `field`: what the file is, for the message."""
     if not is_file(path):
         raise InputError(f"{path}: {field}: no such file")
     return path
@@ -65,7 +72,7 @@ def existing(path: Path, field: str) -> Path:
 def first_file(candidates: list[Path], field: str) -> Path:
     """Return the first candidate that is an existing file. Raises InputError if there is none.
 
-    The message begins with `field`.
+    `field`: the beginning of the message.
     """
     if file := next(filter(is_file, candidates), None):
         return file
@@ -73,17 +80,17 @@ def first_file(candidates: list[Path], field: str) -> Path:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List the image files in a folder, sorted by name.
+    """List the image files in a folder, sorted by name. Hidden files are left out.
 
-    Hidden files are left out, and raw or HEIC files as in `without_raw_twins`.
+    A raw or HEIC file is left out if the same photograph is beside it in another format.
     """
     return without_raw_twins(path for path in folder.glob("[!.]*") if is_image(path))
 
 
 def images_below(folder: Path) -> list[Path]:
-    """List the image files in a folder and all its subfolders, sorted by path.
+    """List the image files in a folder and all its subfolders, sorted by path. Hidden ones are left out.
 
-    Hidden files and folders are left out, and raw or HEIC files as in `without_raw_twins`.
+    A raw or HEIC file is left out if the same photograph is beside it in another format.
     """
     found = []
     for place, inner, files in os.walk(folder):
@@ -93,12 +100,12 @@ def images_below(folder: Path) -> list[Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Return whether a path is an existing file with the suffix of an image format."""
+    """Return True if a path is an existing file with the suffix of an image format."""
     return path.suffix.lower() in image_headers.SUFFIXES and is_file(path)
 
 
 def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
-    """Sort the paths. Leaves out a raw or HEIC file if the same photograph is beside it in another format."""
+    """Return the paths sorted, without a raw or HEIC file if the same name is in the list with another suffix."""
     found = sorted(paths)
     twins = image_headers.RAW + image_headers.HEIF
     others = {path.with_suffix("") for path in found if path.suffix.lower() not in twins}
@@ -106,7 +113,7 @@ def without_raw_twins(paths: Iterable[Path]) -> list[Path]:
 
 
 def numbered_images(folder: Path) -> dict[int, Path]:
-    """Return the image files in a folder: a dict from numbers to paths.
+    """Return the image files in a folder by number.
 
     If all file names are numbers, these are the keys. Otherwise the keys are 0, 1, … in the order of the names. Raises
     InputError if two names are the same number.
@@ -116,7 +123,7 @@ def numbered_images(folder: Path) -> dict[int, Path]:
 
 
 def by_key(files: Iterable[Path], key: Callable[[Path], Key]) -> dict[Key, Path]:
-    """Return a dict from `key(file)` to file. Raises InputError if two files have the same key."""
+    """Return the files in a dictionary with `key(file)` as key. Raises InputError if two files have the same key."""
     found: dict[Key, Path] = {}
     for file in files:
         if (other := found.setdefault(key(file), file)) != file:
@@ -125,9 +132,10 @@ def by_key(files: Iterable[Path], key: Callable[[Path], Key]) -> dict[Key, Path]
 
 
 def chosen(wanted: Collection[int], available: Collection[int], option: str, where: Path) -> list[int]:
-    """Return the `wanted` numbers, sorted. If `wanted` is empty, returns all `available` numbers.
+    """Return the `wanted` numbers, sorted; if there are none, all `available` numbers.
 
-    Raises InputError if a wanted number is not available. The message names `option` and `where`.
+    Raises InputError if a wanted number is not available. `option`: name of the option, for the message. `where`: path
+    that has the available ones, for the message.
     """
     for number in wanted:
         if number not in available:
@@ -136,7 +144,7 @@ def chosen(wanted: Collection[int], available: Collection[int], option: str, whe
 
 
 def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Convert `values` to an array of floats of this `shape`.
+    """Convert values from a file to an array of floats of this `shape`; () for a single number.
 
     Raises InputError if `values` are not finite numbers of this shape. The message begins with `what`.
     """
@@ -154,15 +162,15 @@ def matrix(values: object, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def entry(arrays: Mapping[str, object], key: str, shape: tuple[int, ...], path: Path) -> np.ndarray:
-    """Return the array `key`, which must be of this `shape`. `arrays`: the content of a .mat or .npz file.
+    """Return `arrays[key]` as an array of floats of this `shape`. `arrays`: content of a .mat or .npz file.
 
-    Raises InputError if the array is missing or has another shape. The message names the file `path`.
+    `path`: the file, for the message. Raises InputError if the array is missing or has another shape.
     """
     return matrix(arrays.get(key), shape, f"{path}: {key}")
 
 
 def load_mat(path: Path) -> dict:
-    """Read a MATLAB file. Returns a dict from names of variables to values.
+    """Read a MATLAB file. Returns its variables by name.
 
     A child process reads the file first, because damaged files crash scipy's reader.
     """
@@ -177,7 +185,7 @@ def load_json(path: Path) -> Any:
 
 
 def require_object(value: Any, what: str) -> dict:
-    """Return `value` if it is a JSON object. Otherwise raises InputError. The message begins with `what`."""
+    """Return `value` if it is a JSON object (dict), otherwise raise InputError. The message begins with `what`."""
     if not isinstance(value, dict):
         raise InputError(f"{what}: is {'missing' if value is None else 'no object'}")
     return value
@@ -189,9 +197,9 @@ def load_xml(path: Path) -> ElementTree.Element:
 
 
 def load_lines(path: Path, others: bool = False) -> list[str]:
-    """Return the lines of a text file in UTF-8. Empty lines are left out.
+    """Read the lines of a text file in UTF-8, without empty lines.
 
-    `others`: also accept UTF-16 and the Windows code page 1252.
+    `others`: True: also accept UTF-16 and the Windows code page 1252.
     """
 
     def decoded(file: Path) -> str:
@@ -210,7 +218,7 @@ def load_lines(path: Path, others: bool = False) -> list[str]:
 
 
 def load_table(path: Path, columns: int) -> np.ndarray:
-    """Read a text file of numbers. Returns an array (n, `columns`)."""
+    """Read a text file with `columns` numbers in each line. Returns an array (n, `columns`)."""
     text = read_as(path, "table of numbers", lambda file: file.read_text("utf-8"))
     if not text.strip():
         raise InputError(f"{path}: is empty; must have {columns} numbers a line")

@@ -1,4 +1,4 @@
-"""Cameras of RealityCapture and RealityScan: XMP sidecars, or a table."""
+"""Importer of the cameras of RealityCapture and RealityScan: XMP sidecars, or a table."""
 
 import csv
 import re
@@ -60,7 +60,7 @@ class RealityCapture(Photogrammetry):
         return self.from_sidecars() if self.src.is_dir() else self.from_csv()
 
     def from_sidecars(self) -> Iterator[Frame]:
-        """Yield the photographs that have a sidecar with a pose. The sidecar of x.jpg is x.xmp in the folder SRC."""
+        """Yield the photographs that have a sidecar with a pose. For x.jpg, it is the file x.xmp in the folder SRC."""
         if not (sidecars := sidecars_in(self.src)):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
@@ -81,7 +81,7 @@ class RealityCapture(Photogrammetry):
         self.tell_unused(self.src, said)
 
     def from_csv(self) -> Iterator[Frame]:
-        """Yield the photographs listed in the CSV file."""
+        """Yield the photographs that the CSV file SRC lists. Raises InputError if it is invalid."""
         columns, rows = read_csv(self.src)
         if missing := [name for name in ("name", *POSE, "f") if name not in columns]:
             raise InputError(f"{self.src}: column {missing[0]}: is missing; must be the table of internal and external "
@@ -105,14 +105,15 @@ class RealityCapture(Photogrammetry):
 
 
 def sidecars_in(folder: Path) -> dict[str, Path]:
-    """List the XMP sidecars in a folder: path by name of the photograph without suffix. Hidden ones are left out."""
+    """List the XMP sidecars in a folder by the photograph's name without suffix. Hidden files are left out."""
     return {path.stem: path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() == ".xmp"}
 
 
 def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
-    """Make the frame of a photograph from the `fields` of its XMP sidecar, as `xmp_fields` returns them.
+    """Make the frame of the photograph `image` from its XMP sidecar.
 
-    Raises InputError if a field is invalid. The message begins with `what`.
+    `fields`: texts in the sidecar by RealityCapture's names. Raises InputError if one is invalid. The message begins
+    with `what`.
     """
 
     def numbers(name: str, count: int, default: str | None = None) -> np.ndarray:
@@ -137,7 +138,7 @@ def sidecar_frame(image: Path, fields: dict[str, str], what: str) -> Frame:
 
 
 def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
-    """Return RealityCapture's attributes and elements in an XMP file: a dict from names to texts."""
+    """Return the texts of RealityCapture's attributes and elements in an XMP file, by their names without prefix."""
     found: dict[str, str] = {}
     for element in root.iter():
         found |= {name: value for name, value in element.attrib.items() if name.startswith(XCR)}
@@ -147,9 +148,10 @@ def xmp_fields(root: ElementTree.Element) -> dict[str, str]:
 
 
 def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Read a CSV file. Returns (column names, rows). Lines that begin with #cameras or sep= are skipped.
+    """Read a table of cameras from a CSV file. Returns (column names in lower case, rows of cells).
 
-    It also accepts what spreadsheet programs write: semicolons or tabs, decimal commas, other encodings than UTF-8.
+    Lines that begin with #cameras or sep= are skipped. It also accepts what spreadsheet programs write: semicolons or
+    tabs, decimal commas, other encodings than UTF-8.
     """
     lines = [line for line in load_lines(path, others=True) if not line.startswith(("#cameras", "sep="))]
     separator = max(",;\t", key=lines[0].count) if lines else ","
@@ -163,10 +165,11 @@ def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def film_lens(image: Path, focal: float, centre: list[float], terms: list[float], what: str) -> Lens:
-    """Make the lens of a photograph from the 35 mm equivalent `focal` length [mm].
+    """Make the lens of the photograph `image` from its 35 mm equivalent focal length [mm].
 
-    `centre`: principal point relative to the centre of the photograph, divided by its longer side. `terms`: distortion
-    coefficients in the order of `TERMS`. Raises InputError if k4 is not 0. The message begins with `what`.
+    `focal`: this length. `centre`: principal point relative to the centre of the photograph, divided by its longer
+    side. `terms`: distortion coefficients k1, k2, k3, k4, t1, t2. Raises InputError if k4 is not 0. The message begins
+    with `what`.
     """
     size = image_size(image)
     longer = max(size)

@@ -1,4 +1,4 @@
-"""Record3D's exports."""
+"""Importer of Record3D's exports."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Scenes of Meshroom (AliceVision) and OpenMVG."""
+"""Importer of scenes of Meshroom (AliceVision) and OpenMVG."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -80,7 +80,7 @@ class SfmData(Photogrammetry):
         yield from self.openmvg(top) if "extrinsics" in top or "root_path" in top else self.alicevision(top)
 
     def alicevision(self, top: dict) -> Iterator[Frame]:
-        """Yield the photographs in a Meshroom file. `top`: its top-level JSON object."""
+        """Yield the photographs with a pose in a Meshroom file. `top`: its top-level JSON object."""
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
         poses = self.by_key(top, "poses", "poseId")
@@ -107,10 +107,10 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, pose, what)
 
     def openmvg(self, top: dict) -> Iterator[Frame]:
-        """Yield the photographs in an OpenMVG file. `top`: its top-level JSON object.
+        """Yield the photographs with a pose in an OpenMVG file. `top`: its top-level JSON object.
 
-        OpenMVG writes with the library cereal. It names a polymorphic type where it is first used, and later gives only
-        its number.
+        OpenMVG writes with the library cereal. This names a polymorphic type where it is first used, and later gives
+        only its number.
         """
         root = str(top.get("root_path", ""))
         intrinsics, types = self.by_key(top, "intrinsics", "key"), {}
@@ -137,9 +137,9 @@ class SfmData(Photogrammetry):
             yield from self.frame(file, lens, pose_of(R.T, center), what)
 
     def by_key(self, top: dict, name: str, key: str) -> dict[str, Any]:
-        """Return the entries of the list `top[name]`: a dict from the value of their field `key` to the entry.
+        """Return the objects in the list `top[name]`, by the value of their field `key`; empty if there is no list.
 
-        The dict is empty if there is no such list.
+        `top`: the top-level JSON object. Raises InputError if two objects have the same value.
         """
         values = top.get(name) or []
         if not isinstance(values, list):
@@ -150,15 +150,18 @@ class SfmData(Photogrammetry):
         return found
 
     def frame(self, file: str, lens: Lens, pose: np.ndarray, what: str) -> Iterator[Frame]:
-        """Yield one frame, that of the photograph `file`. Yields nothing if no image file is found for it."""
+        """Yield the frame of the photograph that the file calls `file`, or nothing if no image file is found for it.
+
+        `pose` (4, 4): camera-to-world, OpenCV's axes. `what`: beginning of error messages.
+        """
         if own := self.photograph(file, what, relative=True):
             yield Frame(own, lens, pose, said=file)
 
 
 def file_name(view: dict, field: str, what: str) -> str:
-    """Return the file name in the `field` of a view. Raises InputError if it is missing.
+    """Return the text `view[field]`, the name of a photograph. Raises InputError if it is missing.
 
-    The message begins with `what`.
+    `view`: JSON object of a photograph. The message begins with `what`.
     """
     if not isinstance(view.get(field), str) or not view[field]:
         raise InputError(f"{what}: {field}: is missing; must be the name of a photograph")
@@ -166,24 +169,30 @@ def file_name(view: dict, field: str, what: str) -> str:
 
 
 def pointed_to(own: dict, what: str) -> dict:
-    """Return the object that a smart pointer of the library cereal holds, with the fields of its base class."""
+    """Return the JSON object to which a smart pointer refers, as the library cereal writes it.
+
+    `own`: JSON object with the pointer. Fields of the base class are included. Raises InputError if there is no such
+    object. The message begins with `what`.
+    """
     wrapper = require_object(require_object(own.get("value"), what).get("ptr_wrapper"), f"{what}: ptr_wrapper")
     data = require_object(wrapper.get("data"), f"{what}: data")
     return {**data.get("value0", {}), **data} if isinstance(data.get("value0", {}), dict) else data
 
 
 def type_number(value: dict, path: Path) -> int:
-    """Return the number that the library cereal gives to the polymorphic type of `value`.
+    """Return the number of the polymorphic type of a JSON object that the library cereal has written.
 
-    The highest bit is removed. It only says that a name follows. Raises InputError if there is no number.
+    Its highest bit is removed, which only says that a name follows. `path`: the file, for the message. Raises
+    InputError if there is no number.
     """
     return int(matrix(value.get("polymorphic_id"), (), f"{path}: intrinsics: polymorphic_id")) & 0x7FFFFFFF
 
 
 def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
-    """Make a lens from AliceVision's fields `own`. In AliceVision, pixel centres are integers.
+    """Make a lens from the JSON object `own` of an AliceVision camera. In AliceVision, pixel centres are integers.
 
-    The meaning of the fields depends on the `version` of the file; see sfmDataIO/CHANGES.md of AliceVision.
+    `version`: three numbers of the file's version, on which the meaning of fields depends; see sfmDataIO/CHANGES.md of
+    AliceVision. Raises InputError if a field is invalid. The message begins with `what`.
     """
 
     def number(name: str, default: float | None = None) -> float:
@@ -211,9 +220,10 @@ def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:
 
 
 def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
-    """Make a lens from OpenMVG's fields `own`. In OpenMVG, pixel centres are integers.
+    """Make a lens from the JSON object `own` of an OpenMVG camera. In OpenMVG, pixel centres are integers.
 
-    `kind`: name of the polymorphic type. Raises InputError if the fields are invalid. The message begins with `what`.
+    `kind`: name of its type, which says the distortion model. Raises InputError if a field is invalid. The message
+    begins with `what`.
     """
     focal = float(matrix(own.get("focal_length"), (), f"{what}: focal_length"))
     centre = matrix(own.get("principal_point"), (2,), f"{what}: principal_point") + 0.5
@@ -223,9 +233,11 @@ def openmvg_lens(own: dict, kind: str | None, what: str) -> Lens:
 
 
 def lens_of(size: np.ndarray, intrinsics: tuple, kind: str, given: Any, what: str) -> Lens:
-    """Make a lens with `intrinsics` fx, fy, cx, cy [px] and the distortion model `kind`, a key of `MODELS`.
+    """Make a lens with a distortion model of AliceVision or OpenMVG.
 
-    `given`: the coefficients of the model. If they are missing, they are 0.
+    `size`: (width, height) [px]. `intrinsics`: fx, fy, cx, cy [px]. `kind`: name of the model, a key of `MODELS`.
+    `given`: coefficients of the model, read from a file; empty: all 0. Raises InputError if the model is unknown or
+    `given` is invalid. The message begins with `what`.
     """
     if kind not in MODELS:
         raise InputError(f"{what}: the camera is of type {kind!r}; must be one of {', '.join(MODELS)}")

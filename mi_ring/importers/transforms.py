@@ -1,4 +1,4 @@
-"""transforms.json of NeRF, instant-ngp and nerfstudio."""
+"""Importer of the file transforms.json of NeRF, instant-ngp and nerfstudio."""
 
 import math
 from collections.abc import Iterator
@@ -115,10 +115,10 @@ class Transforms(NamedPhotographs):
 
 
 def transforms_camera(given: dict, image: Path, where: str) -> Lens:
-    """Make the lens of a frame in transforms.json. `image`: its photograph.
+    """Make the lens of a frame in transforms.json. `image`: its photograph, for the size if the file lacks it.
 
-    `given`: the fields of the frame, and those fields of the file that the frame does not have. Raises InputError if a
-    field is invalid or not supported. The message begins with `where`.
+    `given`: the fields of the frame, and of the whole file where the frame lacks them. Raises InputError if a field is
+    invalid or not supported. The message begins with `where`.
     """
 
     def number(*names: str, default: float | None = None) -> float:

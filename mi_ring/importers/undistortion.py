@@ -13,7 +13,7 @@ AT_ONCE = 2**22  #: pixels; interpolating them takes about half a gigabyte
 
 
 class Window(NamedTuple):
-    """A rectangle of the undistorted photograph, and the scale at which it is computed."""
+    """A rectangle of the undistorted photograph, and the scale to which it is reduced."""
 
     left: int  #: first column [px of the photograph]
     top: int  #: first row [px of the photograph]
@@ -23,14 +23,17 @@ class Window(NamedTuple):
 
     @classmethod
     def whole(cls, lens: Lens, longest: int) -> "Window":
-        """Return a window of the whole photograph. Its scale makes its longer side at most `longest` pixels long."""
+        """Return a window of the whole photograph, reduced by a whole number to at most `longest` pixels.
+
+        `longest`: limit of the longer side [px].
+        """
         scale = -(-max(lens.size) // longest)
         return cls(0, 0, lens.size[0] // scale, lens.size[1] // scale, scale)
 
 
 @lru_cache(maxsize=1)
 def source_positions(lens: Lens, window: Window) -> np.ndarray:
-    """Return the position of each pixel of the window in the distorted photograph: rows and columns (2, H, W) [px].
+    """Return where the distorted photograph shows each pixel of the window: rows and columns (2, H, W) [px].
 
     The centre of the first pixel is at 0.
     """
@@ -45,12 +48,13 @@ def source_positions(lens: Lens, window: Window) -> np.ndarray:
 def undistort(
     pixels: np.ndarray, lens: Lens, srgb: bool = False, saturation: float = 1.0, window: Window | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Remove the lens distortion of an image (H, W, C). Returns (image (H, W, C), valid pixels (H, W) bool).
+    """Remove the lens distortion of an image. Returns (image (H, W, C), valid (H, W) bool) of a pinhole camera.
 
-    The result is the image of a pinhole camera with the same intrinsics. Pixels outside the source image are 0 and
-    invalid. `srgb`: the first three channels are sRGB-encoded; they are interpolated as linear values. `saturation`:
-    encoded value (1 = full scale) from which a pixel is clipped; infinite for masks. A pixel of the result is clipped
-    if any pixel that contributes to it is clipped. `window`: the part to compute, with scale 1; None: the whole image.
+    The pinhole camera has the same focal lengths and principal point. `valid` is False where the source image shows
+    nothing; these pixels are 0. `srgb`: the first three channels are sRGB-encoded, so they are interpolated as linear
+    values. `saturation`: encoded value (1 = full scale) from which a pixel is clipped; infinite for masks. A pixel of
+    the result is clipped if any pixel that contributes to it is clipped. `window`: the part to compute, with scale 1;
+    None: the whole image.
     """
     window = window or Window(0, 0, *lens.size)
     rows = max(1, AT_ONCE // window.width)
@@ -64,7 +68,12 @@ def undistort(
 def undistort_part(
     pixels: np.ndarray, lens: Lens, srgb: bool, saturation: float, window: Window
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Do the work of `undistort` for one window. The window must be small, because its arrays are of floats."""
+    """Remove the lens distortion in one window of an image. Returns (image (H, W, C), valid (H, W) bool).
+
+    The window must be small, because its arrays are of floats. `pixels`: the whole distorted image. `srgb`: the first
+    three channels are sRGB-encoded. `saturation`: encoded value (1 = full scale) from which a pixel is clipped;
+    infinite for masks.
+    """
     positions = source_positions(lens, window)
     size = np.array(pixels.shape[:2])
     valid = np.all((positions >= -0.5) & (positions <= size[:, None, None] - 0.5), 0)

@@ -1,4 +1,4 @@
-"""VisualSFM's models."""
+"""Importer of VisualSFM's models."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -68,9 +68,10 @@ class VisualSfm(Photogrammetry):
                 yield Frame(image, lens, pose_of(R.T, np.array([x, y, z])), said=name)
 
     def models(self, lines: list[str]) -> list[list[str]]:
-        """Split the `lines` of the file into models. Returns the lines of the cameras for each model.
+        """Split the lines of the file into models. Returns for each model the lines of its cameras.
 
-        A model is the number of cameras, a line for each camera, the number of points, and a line for each point.
+        A model is written as the number of cameras, a line for each camera, the number of points, and a line for each
+        point.
         """
         models, at = [], 0
 
@@ -90,10 +91,11 @@ class VisualSfm(Photogrammetry):
 
 
 def undistorting_lens(size: tuple[int, int], intrinsics: tuple[float, ...], r: float, what: str) -> Lens:
-    """Make a lens that approximates VisualSFM's radial distortion `r`. `size`: (width, height) [px].
+    """Make a lens that approximates VisualSFM's radial distortion.
 
-    `intrinsics`: fx, fy, cx, cy [px]. Raises InputError if the distortion is too strong for the approximation. The
-    message begins with `what`.
+    `size`: (width, height) [px]. `intrinsics`: fx, fy, cx, cy [px]. `r`: VisualSFM's coefficient, with undistorted
+    radius = distorted radius · (1 + r · distorted radius²) in focal lengths. Raises InputError if the distortion is too
+    strong for the approximation. The message begins with `what`.
     """
     if not r:
         return Lens("PINHOLE", size, intrinsics)

@@ -1,4 +1,4 @@
-"""Writes a scene file and its images. After an error, none of them exists."""
+"""Writes a scene file and its images. After an error, none of them remains."""
 
 import contextlib
 import filecmp
@@ -24,7 +24,10 @@ from mi_ring.system.files import relative_to, write_file
 
 
 class Writer:
-    """Writes the files of a scene into a temporary folder. `finish` moves them to their final places."""
+    """Writes the files of a scene into a temporary folder. At the end, `finish` moves them to their final places.
+
+    `scene`: final path of the scene file.
+    """
 
     def __init__(self, scene: Path) -> None:
         self.scene = scene
@@ -37,7 +40,11 @@ class Writer:
         self.shared: dict = {}  #: relative paths of files that several photographs share, by folder and key
 
     def write(self, file: str, write: Callable[[Path], object]) -> Path:
-        """Call `write` with the path of `file` in the temporary folder. Returns the final path of the file."""
+        """Write a file of the scene into the temporary folder. Returns its final path.
+
+        `file`: path relative to the scene's folder of files. `write`: function that writes to the path that it is
+        given.
+        """
         path = self.staging / file
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path)
@@ -47,7 +54,7 @@ class Writer:
     def image(self, file: str, pixels: np.ndarray) -> Path:
         """Write an image into the temporary folder: float32 as EXR, other types as PNG. Returns its final path.
 
-        `file`: name of the file without suffix.
+        `file`: path relative to the scene's folder of files, without suffix. `pixels`: (H, W, C).
         """
         suffix = ".exr" if pixels.dtype == np.float32 else ".png"
         return self.write(file + suffix, lambda path: write_image(pixels, path))
@@ -57,10 +64,10 @@ class Writer:
         return Path(relative_to(self.scene.parent, path))
 
     def finish(self, xml: bytes) -> None:
-        """Move all files to their final places. Then write the scene file with the content `xml`.
+        """Move all files to their final places, and then write the scene file. `xml`: its content.
 
-        Raises InputError if another file is already at such a place, because it may be a source. A file with the same
-        content is accepted. It may come from an interrupted run.
+        Raises InputError if a file with other content is already at such a place, because it may be a source. The same
+        content is accepted: it may come from an interrupted run.
         """
         for file in self.files:
             place = self.folder / file
@@ -72,7 +79,7 @@ class Writer:
         write_file(self.scene, xml)
 
     def close(self) -> None:
-        """Remove the temporary folder. Also remove folders that this writer created and that are empty."""
+        """Remove the temporary folder, and those folders that this writer created, if they are empty."""
         shutil.rmtree(self.staging, ignore_errors=True)
         for folder in self.new_folders:
             with contextlib.suppress(OSError):  # not empty
@@ -80,11 +87,11 @@ class Writer:
 
 
 def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
-    """Write those files of a frame whose pixels must change: image, mask, valid pixels.
+    """Write the files of a photograph that must change: image, mask and valid pixels. Returns the paths for the scene.
 
-    Pixels change if the lens has distortion, if the photograph must be turned, and if the scene file cannot express the
-    `encoding` of the file. `copy`: also copy the files that need not change. `name`: name of the new files without
-    suffix. Returns the paths of all files, new and old, for the scene file.
+    Pixels change if the lens has distortion, if the photograph must be turned, or if the scene file cannot express the
+    `encoding`. `name`: name of the new files without suffix. `copy`: True: also copy files that need not change; False:
+    the scene refers to the originals.
     """
     straight, pixels, turn = frame.lens.is_pinhole, frame.pixels, frame.orientation
 

@@ -6,9 +6,10 @@ from mi_ring.system.files import read_json
 
 
 def ambiguity(light: str) -> str:
-    """Return the warning for this kind of light, a text for the user; empty if the capture gives the light.
+    """Return a warning for the user about what the fit could not determine; empty if the capture gave the light.
 
-    `light`: `light` in calibration.json, for example "capture" or "2 lamps".
+    `light`: kind of light that the fit assumed, as calibration.json names it, for example "capture" (given) or "2
+    lamps".
     """
     if light == "capture":
         return ""
@@ -20,7 +21,10 @@ def ambiguity(light: str) -> str:
 
 
 def ambiguity_of(run: Path) -> str:
-    """Return the warning of `ambiguity` for a fit. Reads its calibration.json. `run`: results folder, or ring.pt."""
+    """Return a warning about what a fit under unknown light could not determine; empty if the light was given.
+
+    Reads calibration.json. `run`: results folder of the fit, or its file ring.pt.
+    """
     record = read_json((run if run.is_dir() else run.parent) / "calibration.json")
     light = record.get("light") if isinstance(record, dict) else None
     return ambiguity(light) if isinstance(light, str) else ""

@@ -1,4 +1,7 @@
-"""Texture atlases: unwraps the fitted surface, and bakes the networks into images."""
+"""Texture atlases: unwraps the fitted surface, and bakes the networks into images.
+
+The networks are functions on the domain, which is the start surface of the fit in the normalised frame.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,7 +23,7 @@ CHUNK = 2**17  #: texels that the networks evaluate at once
 
 
 class Atlas(NamedTuple):
-    """A mesh with texture coordinates. Its V vertices are duplicated along seams."""
+    """A mesh of the fitted surface with texture coordinates. A vertex on a seam occurs once for each chart."""
 
     s: np.ndarray  # (V, 3) domain points
     uv: np.ndarray  # (V, 2) in [0, 1], the first texel at (0, 0)
@@ -33,10 +36,11 @@ class Atlas(NamedTuple):
 
 
 def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: float = 1.0) -> Atlas:
-    """Unwrap the surface for square textures with sides of `resolution` texels, by xatlas (Young 2018, after Thekla).
+    """Unwrap the fitted surface into one square texture, by xatlas (Young 2018, after Thekla). Returns the mesh.
 
-    `subdivisions`: level of the mesh. `time`: of the deformation, 0 to 1. Raises InputError if the package xatlas is
-    not installed.
+    `subdivisions`: level of the mesh; it has about 10 · 4^level vertices. `resolution`: width of the texture [texels],
+    which sets the gap between charts. `time`: state of the deformation, from 0 (start surface) to 1 (fitted object).
+    Raises InputError if the package xatlas is not installed.
     """
     points, faces = ring.domain.sample(min(subdivisions, MAX_CUT_LEVEL))
     xatlas = need("xatlas", "textures")
@@ -53,9 +57,9 @@ def unwrap(ring: FittedObject, subdivisions: int, resolution: int = 1024, time: 
 
 
 def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndarray:
-    """Map domain points `s` (V, 3) to the surface. Returns points (V, 3) in the normalised frame.
+    """Deform points `s` (V, 3) of the domain. Returns the points (V, 3) of the surface in the normalised frame.
 
-    `time`: of the deformation, 0 to 1.
+    `time`: state of the deformation, from 0 (start surface, the domain itself) to 1 (fitted object).
     """
     with torch.no_grad():
         return ring.shape_net(torch.from_numpy(s.astype(np.float32)).to(ring.center.device), time).cpu().numpy()
@@ -64,10 +68,11 @@ def flow_points(ring: FittedObject, s: np.ndarray, time: float = 1.0) -> np.ndar
 def subdivide(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, *more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Subdivide every triangle into four. Returns (`s`, `uv`, `faces`, `more`…) of the new mesh.
+    """Subdivide every triangle of a mesh into four. Returns the new arrays (s, uv, faces, more…) in this order.
 
-    The mesh: domain points `s` (V, 3), texture coordinates `uv` (V, 2), triangles `faces` (F, 3), and other arrays (V,
-    n) of its vertices. New vertices are projected onto the domain. The other values are interpolated.
+    `s` (V, 3): vertices, points of the domain. `uv` (V, 2): texture coordinates. `faces` (F, 3): triangles. `more`:
+    other arrays (V, n) with values of the vertices. New vertices are projected onto the domain; their `uv` and `more`
+    are means.
     """
     attributes = dict(enumerate((uv, *more)))
     finer, faces, attributes = trimesh.remesh.subdivide(s.astype(float), faces, vertex_attributes=attributes)
@@ -79,10 +84,11 @@ def subdivide(
 def assemble(
     ring: FittedObject, s: np.ndarray, uv: np.ndarray, faces: np.ndarray, subdivisions: int, time: float
 ) -> Atlas:
-    """Make an atlas of a mesh with texture coordinates: compute positions, normals and tangents of its vertices.
+    """Compute positions, normals and tangents of a mesh that has texture coordinates. Returns the complete atlas.
 
-    The mesh: domain points `s` (V, 3), texture coordinates `uv` (V, 2), triangles `faces` (F, 3). `subdivisions`: its
-    level. `time`: of the deformation, 0 to 1.
+    `s` (V, 3): points of the domain, one for each vertex. `uv` (V, 2): texture coordinates. `faces` (F, 3): triangles.
+    `subdivisions`: level of the mesh, only stored. `time`: state of the deformation, from 0 (start surface) to 1
+    (fitted object).
     """
     points, normals, uncut = seamless_surface(ring, s, faces, time)
     # The derivative of the position with respect to u: constant on a triangle, at vertices the mean weighted by area.
@@ -105,9 +111,11 @@ def assemble(
 def seamless_surface(
     ring: FittedObject, s: np.ndarray, faces: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Evaluate the surface at domain points `s` (V, 3) with triangles `faces`. `time`: of the deformation, 0 to 1.
+    """Compute positions and normals of a mesh whose vertices are duplicated along seams. Normals have no seams.
 
-    Returns (points (V, 3) in the normalised frame, normals (V, 3) that are smooth across seams, `Atlas.uncut`).
+    `s` (V, 3): points of the domain, one for each vertex. `faces` (F, 3): triangles. `time`: state of the deformation,
+    from 0 (start surface) to 1 (fitted object). Returns (positions (V, 3) in the normalised frame, unit normals (V, 3),
+    vertex numbers (V,), which are equal for duplicates of one vertex).
     """
     unique, uncut = np.unique(s, axis=0, return_inverse=True)
     uncut = uncut.ravel()
@@ -128,8 +136,9 @@ class Texels:
 def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1.0) -> Texels:
     """Compute the domain point and the normal of each texel of an atlas.
 
-    `resolution`: width and height of the texture [texels]. `time`: of the deformation, 0 to 1. Normals come from the
-    mesh at the level of the fit, if it is finer than the atlas.
+    `resolution`: width and height of the texture [texels]. `time`: state of the deformation for which the atlas was
+    made, from 0 (start surface) to 1 (fitted object). If `ring.subdivisions` is finer than the mesh of the atlas, the
+    normals come from this finer mesh.
     """
     bitangents = np.cross(atlas.normals, atlas.tangents[:, :3]) * atlas.tangents[:, 3:]
     s, uv, faces, *frame = atlas.s, atlas.uv, atlas.faces, atlas.tangents[:, :3], bitangents, atlas.normals
@@ -164,7 +173,10 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
 
 
 def reflectances(ring: FittedObject, s: np.ndarray) -> dict[str, np.ndarray]:
-    """Evaluate BRDF-Net at domain points `s` (N, 3). Returns the BSDF parameters (N, 3) or (N,) by name."""
+    """Evaluate the material network at points `s` (N, 3) of the domain.
+
+    Returns the BSDF parameters as arrays (N, 3) or (N,), with the parameters' names as keys.
+    """
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
         parts = [ring.material(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]

@@ -18,7 +18,7 @@ LISTED = 6  #: unknowns of one kind that are listed one by one
 
 
 class Panel(NamedTuple):
-    """The report's section about calibration: a table, a chart and a warning."""
+    """The report's section about calibration: a table, a chart and a warning about what the fit could not determine."""
 
     rows: list[tuple[str, str, str, str]]  #: quantity, before, after, standard deviation
     chart: str  #: a data URI
@@ -26,7 +26,11 @@ class Panel(NamedTuple):
 
 
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
-    """Make the section from the capture `before` and `after` the fit. `refined`: content of calibration.json."""
+    """Make the report's section about calibration. Draws its chart, and renders nothing.
+
+    `before`, `after`: the capture with the calibration before and after the fit. `refined`: content of
+    calibration.json.
+    """
     rows = [row(entry) for entry in refined["unknowns"].values()]
     light = refined.get("light", "capture")
     if light != "capture":
@@ -38,8 +42,8 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
     """Format an unknown as a row: (quantity, value in the scene file, value that the fit found, standard deviation).
 
-    `entry`: the unknown's entry in calibration.json. If it has many values, the second cell is empty, and the third has
-    the median and the largest change.
+    `entry`: the unknown's entry in calibration.json, with keys `what`, `before`, `after` and `std`. If it has more than
+    `LISTED` values, the second cell is empty, the third has the median and the largest change, and the fourth a median.
     """
     if np.size(entry["after"]) > LISTED:
         several = len(entry["after"]), -1
@@ -53,16 +57,17 @@ def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
 
 
 def numbers(value: Any, digits: int) -> str:
-    """Format a number, or a list of numbers, with `digits` significant digits."""
+    """Format a number or a list of numbers as text, separated by commas, each with `digits` significant digits."""
     values = np.ravel(value)
     least = 1e-6 * np.abs(values).max()  # below it is rounding
     return ", ".join(f"{0.0 if abs(v) < least else v:.{digits}g}" for v in values)
 
 
 def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Summarise the unknowns of single photographs by medians over all photographs. Returns entries for `row`.
+    """Summarise the refined poses and lights of single photographs by medians over all photographs.
 
-    `photographs`: the entry of this name in calibration.json.
+    `photographs`: `photographs` in calibration.json, an entry for each file name. Returns an entry for each quantity: a
+    dictionary with keys `what` (a text with the unit), `before` (0), `after` and `std`.
     """
     entries = list(photographs.values())
     result = []
@@ -80,9 +85,10 @@ def of_photographs(photographs: dict[str, dict[str, Any]]) -> list[dict[str, Any
 
 
 def held_out_text(held_out: dict[str, Any]) -> str:
-    """Return a sentence for the user about the held-out photographs.
+    """Return a text for the user: how well the fit predicts the photographs that it did not use.
 
-    `held_out`: result of `mi_ring.fitting.validation.validate`; empty if the fit ended early.
+    `held_out`: `held_out` in calibration.json, with the shares `unexplained` and `before` of the object's light, and
+    `put_back`, the kinds of unknowns that were reset. It is empty if the fit ended early.
     """
     if not held_out:
         return "not tested: the fit ended early"
@@ -97,10 +103,11 @@ def held_out_text(held_out: dict[str, Any]) -> str:
 
 
 def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]]) -> str:
-    """Draw the charts of the section. Returns an SVG data URI.
+    """Draw one or two diagrams about the calibration. Returns them as one SVG data URI.
 
-    The first chart shows cameras and lights from above, before and after the fit. The second chart shows the unknown
-    environment, or the shift of each photograph, or its light power. `photographs`: as for `of_photographs`.
+    The first shows cameras and lights from above, before and after the fit. The second shows the first of these that
+    was refined: the unknown environment, the shift of the object in each photograph, the light power of each
+    photograph. `photographs`: `photographs` in calibration.json, an entry for each file name.
     """
     moved = [entry["moved_px"] for entry in photographs.values()]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
@@ -139,9 +146,9 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
 
 
 def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
-    """Draw cameras, viewing directions and lights into `axes`, projected to a plane.
+    """Draw cameras, viewing directions and lights of a capture into `axes`, projected orthogonally to a plane.
 
-    `plane` (2, 3): two unit vectors that span the plane.
+    `plane` (2, 3): two orthogonal unit vectors that span the plane. `colour`: of all marks. `label`: for the legend.
     """
     poses = np.stack([shot.camera.to_world for shot in capture.shots])
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T

@@ -1,4 +1,4 @@
-"""The views that mi-ring render renders: the photographs of a scene, or the frames of a film."""
+"""Lists and renders the views of the command mi-ring render: the photographs of a scene, or the frames of a film."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -90,18 +90,18 @@ class RenderConfig(MaterialOptions):
 
     @property
     def count(self) -> int:
-        """Number of pictures that --turntable, --light-orbit or --flow asks for; 0 if none of them is given."""
+        """Number of pictures that --turntable, --light-orbit or --flow asks for; 0 without these options."""
         return self.turntable or self.light_orbit or self.flow
 
     @property
     def film(self) -> bool:
-        """Test whether the output is one film, not a folder of pictures."""
+        """True if the output is an MP4 file, False if it is a folder of pictures."""
         return self.out.suffix.lower() == ".mp4"
 
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A picture to render: camera, light, file name and time of the flow."""
+    """A picture to render: camera, light, file name and state of the deformation."""
 
     shot: Shot
     name: str  #: of the picture's file
@@ -110,9 +110,9 @@ class RenderedView:
 
 
 def integrator_of(config: RenderConfig) -> mi.Integrator | None:
-    """Make the Mitsuba integrator that the options name. Returns None for `photometric`.
+    """Make the Mitsuba integrator that the options name. Returns None if they name mi_ring's own renderer, photometric.
 
-    Raises InputError for an unknown name, and for an integrator that does not start at the camera.
+    Raises InputError for an unknown name, and for an integrator that does not start its paths at the camera.
     """
     name = config.integrator or ("path" if config.envmap else "photometric")
     if name == "photometric":
@@ -129,7 +129,8 @@ def integrator_of(config: RenderConfig) -> mi.Integrator | None:
 def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list[RenderedView]:
     """List the views to render: the photographs of the scene, or the frames of a film. Renders nothing.
 
-    Raises InputError if --view names no photograph, or if --light-orbit has no light to move.
+    `ring`: the object; the camera of a film is turned and zoomed to it. Raises InputError if --view names no
+    photograph, or if --light-orbit is given and the photographs have no light of their own.
     """
     count = config.count
     if not count:
@@ -172,14 +173,15 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
 
 
 def up_of(capture: Capture, config: RenderConfig) -> np.ndarray:
-    """Return the up direction as a unit vector (3,): from --up if it is given, otherwise from the capture."""
+    """Return the up direction, a unit vector (3,): from --up if this option is given, otherwise from the capture."""
     return capture.up if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
 
 
 def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, np.ndarray]:
     """Rotate and zoom a camera so that object and start surface fill the picture. The camera keeps its position.
 
-    Returns (new camera, centre (3,) of the object [scene units]). `up` (3,): up direction.
+    `up` (3,): unit vector that points up in the picture. Returns (new camera, centre (3,) of the object's bounding box
+    [scene units]).
     """
     s = ring.domain.sample(3)[0].numpy()
     points = np.concatenate([flow_points(ring, s, time) for time in (0.0, 1.0)]).astype(float)
@@ -199,10 +201,10 @@ def framed(camera: Camera, ring: FittedObject, up: np.ndarray) -> tuple[Camera, 
 
 
 def lit_surface(capture: Capture, ring: FittedObject, config: RenderConfig) -> Surface:
-    """Make the surface that is rendered: the object in the scene.
+    """Make the surface to render: the object with the lights and the other shapes of the scene.
 
-    With --envmap, the environment map replaces the lights of the photographs, and tables are left out. Raises
-    InputError if the file of the environment map cannot be read.
+    With --envmap, the environment map replaces the lights of the photographs, and `table` shapes are left out. Raises
+    InputError if the environment map cannot be read.
     """
     if not config.envmap:
         return Surface(capture.scene, capture.shape, ring, in_scene_units=integrator_of(config) is not None)
@@ -226,7 +228,8 @@ def render_views(
 ) -> Iterator[np.ndarray]:  # fmt: skip
     """Render the views one by one. Yields pictures (H, W, 3) of linear radiance.
 
-    `integrator`: from `integrator_of`; None: photometric.
+    `surface`: has the scene to render; `ring` is written to its mesh. `integrator`: Mitsuba integrator; None: mi_ring's
+    own renderer, photometric. `capture`: for photometric, it gives the room light and says whether there are shadows.
     """
     s, faces = ring.domain.sample(ring.subdivisions if config.subdivisions is None else config.subdivisions)
     shown = None
@@ -244,10 +247,10 @@ def render_views(
 
 
 def render_passes(scene: mi.Scene, sensor: Any, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
-    """Render a picture (H, W, 3) with a Mitsuba integrator in several passes, and return their average.
+    """Render a picture with a Mitsuba integrator. Returns linear radiance (H, W, 3).
 
-    With several passes, the memory does not grow with `spp`. A pass has at most `LANES` rays, but at least one per
-    pixel.
+    It is the mean of several passes, so that memory does not grow with `spp`, the samples per pixel. A pass has at most
+    `LANES` rays, but at least one per pixel. `sensor`: Mitsuba's sensor with its film.
     """
     width, height = sensor.camera.size
     at_once = min(spp, max(1, LANES // (width * height)))

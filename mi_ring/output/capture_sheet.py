@@ -25,9 +25,9 @@ LEGEND = (
 
 
 def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
-    """Draw cameras, viewing directions, lights and the normalising sphere, projected along each of the three axes.
+    """Draw cameras, viewing directions, lights and the normalising sphere in three panels, one along each axis.
 
-    `center` (3,), `radius`: normalising sphere [scene units].
+    `center` (3,), `radius`: the normalising sphere, which contains the object [scene units].
     """
     cameras, lights = np.stack([shot.camera.to_world for shot in capture.shots]), capture.photographs.lights
     reach = max(np.linalg.norm(cameras[:, :3, 3] - center, axis=1).max(), 1.5 * radius)
@@ -51,9 +51,10 @@ def plan(capture: Capture, center: np.ndarray, radius: float) -> Image.Image:
 
 
 def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.ndarray, radius: float) -> Image.Image:
-    """Draw the contact sheet: the plan, then the photographs with visual hull, mask outlines and invalid pixels.
+    """Draw the contact sheet: a plan of cameras and lights, then photographs with mask outlines and the visual hull.
 
-    `rows`: quality of the photographs. `center` (3,), `radius`: normalising sphere [scene units].
+    `rows`: quality of each photograph, in the order of the capture. `center` (3,), `radius`: the normalising sphere,
+    which contains the object [scene units].
     """
     top = plan(capture, center, radius)
     try:

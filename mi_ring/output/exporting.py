@@ -30,11 +30,12 @@ def export(
 ) -> list[Path]:  # fmt: skip
     """Write a fitted object as PLY, OBJ, GLB or Mitsuba XML, by the suffix of `file`. Returns all files written.
 
-    `subdivisions`: level of the mesh, about 10 · 4^level vertices; default: the level of the fit, at most 5 for GLB.
-    `resolution`: width of the textures [px]. `time`: of the deformation, 0 to 1. `metres`: length of a scene unit [m],
-    only for GLB; default: the length that the object knows. `views`: cameras of the photographs; if they are given, PLY
-    and GLB mark the vertices that a photograph shows. `photograph`: for XML, (photograph whose camera and light the
-    scene gets, room light (BASIS, 3) or None).
+    `subdivisions`: level of the mesh, about 10 · 4^level vertices; None: the level of the fit, at most 5 for GLB.
+    `resolution`: width of the textures [px]. `time`: state of the deformation, from 0 (start surface) to 1 (fitted
+    object). `metres`: length of a scene unit [m], only for GLB; None: the length that `ring` knows, if any. `views`:
+    cameras and masks of the photographs; PLY and GLB then mark the vertices that a photograph shows. `photograph`: for
+    XML, a pair of the photograph whose camera and light are written and the room light, spherical harmonics (BASIS, 3)
+    or None.
 
     Raises InputError for values out of range, for a BSDF that glTF cannot express, and if a file cannot be written.
     """
@@ -67,9 +68,10 @@ def export(
 def require_exportable(
     file: Path, subdivisions: int | None, resolution: int, time: float, metres: float | None
 ) -> str:  # fmt: skip
-    """Check the arguments of `export`. Returns the suffix of `file`, one of `KINDS`.
+    """Check arguments for the export to `file`. Returns its suffix in lower case: .ply, .obj, .glb or .xml.
 
-    Raises InputError if an argument is invalid.
+    `subdivisions`: level of the mesh; None: any. `resolution`: width of the textures [px]. `time`: state of the
+    deformation, 0 to 1. `metres`: length of a scene unit [m]; None: not given. Raises InputError if one is invalid.
     """
     kind = file.suffix.lower()
     if kind not in KINDS:

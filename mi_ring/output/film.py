@@ -15,16 +15,16 @@ from mi_ring.system.files import partial_path, writing
 
 
 def write_picture(linear: np.ndarray, path: Path) -> None:
-    """Write a picture of linear values (H, W, 3) to a file: unchanged to .exr, otherwise as 8-bit sRGB."""
+    """Write a picture of linear radiance (H, W, 3): unchanged to an .exr file, to other files as 8-bit sRGB."""
     exr = path.suffix.lower() == ".exr"
     write_image(linear.astype(np.float32) if exr else to_bytes(linear_to_srgb(linear)), path)
 
 
 def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int], fps: float) -> None:
-    """Write linear pictures (H, W, 3) as an MP4 file (H.264) that browsers can play.
+    """Write pictures (H, W, 3) of linear radiance as an MP4 file (H.264) that browsers can play.
 
-    `size`: (width, height) [px] of the pictures. If one is odd, the film gets one more column or row. `fps`: pictures
-    per second. Raises InputError if the file cannot be written. After an error there is no partial file.
+    `size`: (width, height) of the pictures [px]; an odd side is extended by one pixel. `fps`: pictures per second.
+    Raises InputError if the file cannot be written. After an error, no incomplete file remains.
     """
     partial = partial_path(path)  # without .mp4, so that ffmpeg must be told the format
     odd_columns, odd_rows = size[0] % 2, size[1] % 2

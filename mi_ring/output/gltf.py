@@ -24,7 +24,7 @@ LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatne
 
 
 class Material(NamedTuple):
-    """The material of N points as parameters of glTF. All values are linear."""
+    """The material of N points as parameters of glTF. Colours are linear, not sRGB."""
 
     base_color: np.ndarray  # (N, 3), in [0, 1]
     metallic: np.ndarray  # (N,)
@@ -83,14 +83,15 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
 
 def require_expressible(ring: FittedObject) -> None:
-    """Raise InputError if glTF cannot express the material of an object. It is quick; call it before `glb`."""
+    """Raise InputError if glTF cannot express the material of an object. This check is quick."""
     metallic_roughness(ring.bsdf, reflectances(ring, ring.domain.sample(2)[0].numpy()))
 
 
 def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
-    """Convert a material to textures. Returns arrays (H, W, 3 or 4) uint8 by their glTF names.
+    """Convert a material to textures. Returns uint8 arrays (H, W, 3 or 4), with glTF's names as keys.
 
-    `material`: the material at the N points of `texels`.
+    `material`: the material at the N points of `texels`. `texels`: these points, and which of them each pixel shows.
+    Base colours are encoded as sRGB, other values linearly.
     """
     ones = np.ones_like(material.roughness)
     images = {
@@ -106,14 +107,16 @@ def glb(
     ring: FittedObject, subdivisions: int, resolution: int, time: float = 1.0, metres: float | None = None,
     views: Sequence[MaskedCamera] | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """Make a GLB file of an object. Returns its bytes.
+    """Make a GLB file of an object, with positions in scene units. Returns the bytes of the file.
 
-    `subdivisions`: level of the mesh. `resolution`: width and height of the textures [texels]. `time`: of the
-    deformation, 0 to 1. Positions are in scene units and in the scene's frame. `metres`: length of a scene unit [m]; a
-    node scales the positions to metres. `up` (3,): up direction; the node turns it to the y axis. The parameters of the
-    BSDF are vertex attributes (_DIFFUSE, …); the extras of the material describe them. `views`: if they are given, the
-    vertex attribute _SEEN is 1 for vertices that a view shows, otherwise 0. Raises InputError if glTF cannot express
-    the material.
+    `subdivisions`: level of the mesh, about 10 · 4^level vertices. `resolution`: width of the textures [texels].
+    `time`: state of the deformation, from 0 (start surface) to 1 (fitted object). `metres`: length of a scene unit [m];
+    a node scales the positions to metres; None: no scale. `up` (3,): up direction; the node turns it to the y axis;
+    None: no rotation. `views`: cameras and masks of photographs; the vertex attribute _SEEN is 1 where one of them
+    shows the vertex, otherwise 0; None: no such attribute.
+
+    The parameters of the BSDF are vertex attributes, too (_DIFFUSE, …); the extras of the material describe them.
+    Raises InputError if glTF cannot express the material.
     """
     require_expressible(ring)
     atlas = unwrap(ring, subdivisions, resolution, time)
@@ -131,10 +134,12 @@ def assemble_glb(
     atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
     metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
-    """Make a GLB file from a mesh and its textures. Returns its bytes.
+    """Make a GLB file from a mesh with V vertices and its textures. Returns the bytes of the file.
 
-    `atlas`: the mesh with V vertices. `images`: result of `textures`. `exact`: parameters of the BSDF at the vertices,
-    by name. `bsdf`: Mitsuba's XML. `seen` (V,) bool: vertices that a photograph shows. Other arguments: as for `glb`.
+    `images`: uint8 arrays (H, W, 3 or 4) by glTF's names of textures. `material`: its constant factors are used.
+    `exact`: BSDF parameters (V, 3) or (V,) by name, written as vertex attributes. `bsdf`: Mitsuba's XML of the BSDF.
+    `metres`: length of a scene unit [m], None: unknown. `seen` (V,) bool: True where a photograph shows the vertex;
+    None: no such attribute. `up` (3,): up direction, which a node turns to the y axis; None: no rotation.
     """
     blob = bytearray()
     buffer_views: list[pygltflib.BufferView] = []

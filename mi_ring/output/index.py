@@ -1,4 +1,4 @@
-"""Writes index.html: a page that lists many fits, with a picture and numbers from each report."""
+"""Writes index.html: a page that lists many fits, with a picture and numbers from the report of each fit."""
 
 import base64
 import contextlib
@@ -33,7 +33,7 @@ STATES = "done", "running", "interrupted", "waiting", "failed"  #: of fits
 
 
 class Entry(NamedTuple):
-    """A fit, as a row of the page."""
+    """A fit that the page lists in a row."""
 
     name: str
     state: str  #: of STATES
@@ -43,7 +43,10 @@ class Entry(NamedTuple):
 
 
 def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
-    """Write index.html into the folder `out`. `running`: fits are running, so browsers reload the page regularly."""
+    """Write index.html into the folder `out`, which is created if necessary. Reads the report of each fit.
+
+    `running`: True while fits are running: browsers then reload the page regularly.
+    """
     template = resources.files("mi_ring.output").joinpath("index.html.jinja").read_text("utf-8")
     rows = [row_of(entry, out) for entry in entries]
     states = [entry.state for entry in entries]
@@ -56,7 +59,11 @@ def write_index(out: Path, entries: Sequence[Entry], running: bool) -> None:
 
 
 def row_of(entry: Entry, out: Path) -> dict:
-    """Collect the values that the page shows in the row of a fit, by name, for the template."""
+    """Collect what the page shows about a fit. Returns a dictionary for the template of the page.
+
+    Its keys are the fields of Entry, `figures` (texts by name), `picture` (a data URI or None), and `link` and `log`,
+    the links to report and log for a page in the folder `out` (None if there is no such file).
+    """
     figures: dict[str, str] = {}
     picture, report = None, entry.folder / "report.html"
     with contextlib.suppress(OSError, ValueError):
@@ -75,9 +82,10 @@ def link_to(file: Path, out: Path) -> str | None:
 
 @functools.lru_cache(maxsize=4096)
 def report_summary(report: Path, modified: int) -> tuple[dict[str, str], str | None]:
-    """Read a report. Returns (its numbers by name, thumbnail of the first predicted photograph, a data URI or None).
+    """Read numbers and a picture from a report. Returns (numbers as texts by name, data URI of the picture or None).
 
-    `modified`: modification time of the file. It serves as a key of the cache: the page is rewritten often.
+    The picture is a thumbnail of the first predicted photograph. `modified`: modification time of the file [ns].
+    Results are cached by path and modification time, because the index page is rewritten often.
     """
     page = report.read_text("utf-8")
     cells = re.findall(r"<tr><th>([^<]*)</th><td>([^<]*)</td></tr>", page)

@@ -1,4 +1,4 @@
-"""Inspection of a capture: a table of its photographs, findings and a contact sheet."""
+"""Inspection of a capture: a table of its photographs, a list of problems, and a contact sheet."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,27 +18,36 @@ from mi_ring.system.progress import progress
 
 @dataclass(frozen=True)
 class Inspection:
-    """The result of `inspect`: a text, the problems and the contact sheet."""
+    """The result of an inspection: a text, the problems and the contact sheet."""
 
     text: str  #: the table of photographs and the findings
     findings: list[str]  #: the problems to correct
     page: Image.Image  #: the contact sheet
 
     def save(self, path: Path, field: str) -> None:
-        """Write the contact sheet as a PNG file. Raises InputError, which names the `field`, if that fails."""
+        """Write the contact sheet as a PNG file. `field`: name of the command's option, for the error message.
+
+        Raises InputError if the file cannot be written.
+        """
         with writing(f"{path}: {field}"):
             path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, encoded_picture(self.page))
 
 
 def inspect(capture: Capture) -> Inspection:
-    """Check a capture before a fit. It reports empty masks and then ignores them. Writes no file."""
+    """Check a capture before a fit, and draw its contact sheet. Writes no file.
+
+    Empty masks are reported as problems; the other checks then ignore them.
+    """
     with progress(None, "inspecting", 4) as bar:
         return inspected(capture, bar.update)
 
 
 def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
-    """Do the same as `inspect`, and call `advance` after each of the four steps."""
+    """Check a capture before a fit, and draw its contact sheet. Writes no file.
+
+    `advance` is called without arguments after each of the four steps, for a progress bar.
+    """
     capture, empty = without_empty_masks(capture)
     found = [f"{name}: its mask is empty: next to nothing in it is above 127" for name in empty]
     try:

@@ -1,4 +1,4 @@
-"""Writes a scene that Mitsuba renders without mi_ring: it has only textures and Mitsuba's own plugins."""
+"""Writes a scene that Mitsuba renders without mi_ring, because it uses only textures and Mitsuba's own plugins."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -20,9 +20,10 @@ from mi_ring.system.files import write_file
 
 
 def first_photograph(run: Path) -> tuple[Shot, np.ndarray | None]:
-    """Read scene.xml in the results folder `run`. Returns (first photograph, room light (BASIS, 3) or None).
+    """Read scene.xml in the results folder `run`.
 
-    Raises InputError if there is no scene.xml, or if neither the photograph nor the room has a light.
+    Returns (first photograph, room light as spherical harmonics (BASIS, 3) or None). Raises InputError if there is no
+    scene.xml, or if neither the photograph nor the room has a light.
     """
     if not run.is_dir():
         raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
@@ -38,10 +39,12 @@ def write_scene(
     path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], shot: Shot,
     room: np.ndarray | None,
 ) -> list[Path]:  # fmt: skip
-    """Write a scene with the textured object and the camera and light of a photograph. Returns the paths of its files.
+    """Write a scene with the textured object, and camera and light of a photograph. Returns the paths of its files.
 
-    `values`: parameters of the BSDF at the N texels, by name. `bsdf`: Mitsuba's XML. `shot`: the photograph. `room`
-    (BASIS, 3): room light; the scene gets it if the photograph has no light.
+    `path`: the XML file; the other files lie beside it. `texels`: the N points with values, and which of them each
+    texel shows. `values`: BSDF parameters (N, 3) or (N,) by name. `bsdf`: Mitsuba's XML. `shot`: the photograph. `room`
+    (BASIS, 3): room light, spherical harmonics; it becomes an environment map if the photograph has no light. None: no
+    room light.
     """
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)

@@ -12,10 +12,10 @@ from mi_ring.system.files import write_file
 
 
 def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material) -> list[Path]:
-    """Write OBJ, MTL and PNG files. Returns their paths.
+    """Write a textured mesh as OBJ, MTL and PNG files. Returns their paths, the OBJ file first.
 
-    `path`: the OBJ file. `material`: the material at the texels. Along seams, texture coordinates are duplicated, but
-    vertices are not.
+    `path`: the OBJ file; the other files lie beside it. `material`: the material at the N points of `texels`. Texture
+    coordinates are duplicated along seams, vertices are not.
     """
     baked, files = gltf.textures(material, texels), {}
     for name, image in {

@@ -17,9 +17,10 @@ def write_mesh(
 ) -> float | None:
     """Write the surface as a PLY file in scene units. Vertex attributes are the BSDF parameters (vertex_diffuse, …).
 
-    `subdivisions`: level of the mesh. `time`: of the deformation, 0 to 1. `views`: if they are given, the attribute
-    vertex_seen is 1 for vertices that a view shows, otherwise 0. Returns the share of the area that no view shows; None
-    without `views`.
+    `subdivisions`: level of the mesh, about 10 · 4^level vertices. `time`: state of the deformation, from 0 (start
+    surface) to 1 (fitted object). `views`: cameras and masks of photographs; the attribute vertex_seen is 1 where one
+    of them shows the vertex, otherwise 0. Returns the share of the surface area that no photograph shows; None without
+    `views`.
     """
     s, faces = ring.domain.sample(subdivisions)
     with torch.no_grad():

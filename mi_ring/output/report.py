@@ -46,7 +46,7 @@ SHIFTED, ALL_SHIFTED = 1.0, 0.25  # shift of one photograph relative to the othe
 
 @dataclass
 class PhotographPanel:
-    """One photograph of the report: its numbers, and its pictures as data URIs."""
+    """One photograph of the report: its numbers, and its pictures as data URIs by title."""
 
     name: str
     psnr: float
@@ -59,10 +59,10 @@ class PhotographPanel:
 
 
 def report_html(result: FitResult, glb: bytes | None = None, unseen: float | None = None) -> str:
-    """Make the report of a fit. Renders photographs. Returns HTML.
+    """Make the report of a fit. Renders photographs. Returns the HTML text, and writes no file.
 
-    `glb`: the bytes of a GLB file, for the viewer; None: no viewer. `unseen`: share of the surface area that no
-    photograph shows.
+    `glb`: bytes of a GLB file, which the viewer of the page shows; None: no viewer. `unseen`: share of the surface area
+    that no photograph shows; None: unknown.
     """
     capture, ring, refined = result.capture, result.ring, result.calibration
     surface = result.drawn(ring.subdivisions)
@@ -108,9 +108,10 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
 
 
 def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
-    """Choose what the viewer shows first. Returns `up` direction, `eye` position and `irradiance` (RGB), by name.
+    """Choose camera and light with which the viewer of the report starts. Returns lists of three numbers by name.
 
-    The irradiance is that at the centre of the object. All are in scene units.
+    `up`: up direction. `eye`: position of the first photograph's camera [scene units]. `irradiance`: RGB at the centre
+    of the object, the median over the photographs; 1 if the photographs have no light of their own.
     """
     eye = capture.shots[0].camera.position
     irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
@@ -125,8 +126,9 @@ def fit_findings(
 ) -> list[str]:  # fmt: skip
     """List problems of a fit as sentences for the user. Each sentence contains advice.
 
-    `rows`: the fitted photographs. `iteration`: number of iterations that are done, of `iterations`. `refined`: content
-    of calibration.json. `unexplained`: share of the object's light that the fit does not predict.
+    `rows`: the photographs that the fit used. `iteration`: number of iterations that are done. `iterations`: number
+    that the whole fit has. `refined`: content of calibration.json; None: nothing was refined. `unexplained`: share of
+    the object's light that the fit does not predict, 0 to 1.
     """
     found = []
     if iteration == iterations >= FEW_ITERATIONS and unexplained > UNEXPLAINED:
@@ -180,17 +182,19 @@ def middle(values: Sequence[float] | Sequence[tuple[float, float]]) -> tuple[np.
 
 
 def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
-    """Return a line for the user that lists the photographs with the lowest ranks; empty if there are none.
+    """Return a text for the user that lists the photographs with the lowest ranks; empty if there are no photographs.
 
-    `photographs`: tuples (rank, name, number as text). `most`: number of photographs that are listed; the line counts
-    the others.
+    `photographs`: tuples (rank, name, number as text). `most`: how many are listed by name; the text counts the others.
     """
     ranked = [f"{name} ({number})" for _, name, number in sorted(photographs)]
     return ", ".join(ranked[:most]) + (f" and {len(ranked) - most} more" if len(ranked) > most else "")
 
 
 def sides(x: float, y: float) -> str:
-    """Describe a shift in words. `x`: to the right [px]. `y`: downward [px]."""
+    """Describe a shift of (`x`, `y`) pixels as text, for example "1.0 px to the right and 2.0 px above".
+
+    A positive `x` is a shift to the right, a positive `y` is a shift downward.
+    """
     return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
 
 
@@ -203,15 +207,18 @@ class PredictedPhotograph(NamedTuple):
 
 
 def scale_of(result: FitResult, size: tuple[int, int]) -> int:
-    """Return the factor by which photographs of this size are reduced before they are compared.
+    """Return the factor by which photographs of this size are reduced before the report compares them.
 
-    It is that of the last stage of the fit. `size`: (width, height) [px].
+    `size`: (width, height) [px]. The width is then at most the width in the last stage of the fit.
     """
     return -(-size[0] // result.width)
 
 
 def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[PredictedPhotograph]:
-    """Render the predictions of photographs `index`, all of one size."""
+    """Render the predictions of the photographs with indices `index` (n,). All of them must have the same size.
+
+    `surface`: the fitted surface, ready for rendering. Returns n predictions in the order of `index`.
+    """
     capture, ring = result.capture, result.ring
     size = capture.shots[index[0]].size
     scale = scale_of(result, size)
@@ -229,12 +236,19 @@ def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Pr
 def panels_of(
     result: FitResult, index: np.ndarray, predictions: Sequence[PredictedPhotograph]
 ) -> list[tuple[PhotographPanel, float]]:
-    """Call `panel_of` for each of the photographs `index`. Returns the list of results."""
+    """Compare photographs with their predictions. Returns (panel, mean squared sRGB error) for each, in this order.
+
+    `index` (n,): indices of the photographs. `predictions`: their n rendered predictions.
+    """
     return [panel_of(result, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
 def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tuple[PhotographPanel, float]:
-    """Make the panel of photograph `k`. Returns (panel, mean squared sRGB error over the `comparable` pixels)."""
+    """Compare photograph `k` with its prediction. Returns (panel for the report, mean squared sRGB error).
+
+    The error is the mean over all valid pixels. If the room was lit and the photograph has a mask, it is the mean over
+    the valid pixels in the mask.
+    """
     capture, brdf_net = result.capture, result.ring.brdf_net
     scale = scale_of(result, capture.shots[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps

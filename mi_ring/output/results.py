@@ -32,9 +32,10 @@ VIEWED, TEXELS = 5, 1024  #: finest level of the object in the report's viewer, 
 
 
 def default_folder(scene: Path) -> Path:
-    """Return the default results folder of a scene file, out/NAME.
+    """Return the default results folder of a scene file: out/NAME, relative to the working directory.
 
-    Raises InputError if the folder contains the results of another scene.
+    NAME is the file name without suffix; for NAME/scene.xml it is the name of the folder. Raises InputError if out/NAME
+    contains the results of another scene.
     """
     folder, other = Path("out") / scene_name(scene), None
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # config.json is missing or damaged
@@ -46,11 +47,11 @@ def default_folder(scene: Path) -> Path:
 
 
 def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """Make the results folder and write config.json into it.
+    """Create the results folder, and write config.json into it. If it has earlier results, rename it first.
 
-    `scene`: the scene file. config.json contains `options` and the path of the scene file relative to the folder. If
-    the folder contains earlier results, it is renamed, unless `resume` is true. Raises InputError if the folder cannot
-    be written or contains the scene file.
+    `scene`: the scene file. `options`: content of config.json; the path of `scene` relative to the folder is added.
+    `resume`: keep a folder with earlier results as it is. Raises InputError if the folder cannot be written or if it
+    contains the scene file.
     """
     if folder.resolve() in scene.resolve().parents:
         raise InputError(f"{folder.resolve()}: --out: holds the scene file {scene.name} itself; choose another folder")
@@ -58,7 +59,12 @@ def prepare_folder(folder: Path, scene: Path, options: dict, resume: bool = Fals
 
 
 def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) -> None:
-    """Do the same as `prepare_folder`, but allow a folder that contains the scene file."""
+    """Create the results folder, and write config.json into it. If it has earlier results, rename it first.
+
+    `scene`: the scene file, which may lie in the folder. `options`: content of config.json; the path of `scene`
+    relative to the folder is added. `resume`: keep a folder with earlier results as it is. Raises InputError if the
+    folder cannot be written.
+    """
     with writing(f"{folder}: --out"):
         if not resume and any((folder / name).exists() for name in PRECIOUS):
             move_aside(folder)
@@ -70,17 +76,17 @@ def make_folder(folder: Path, scene: Path, options: dict, resume: bool = False) 
 
 
 def move_aside(folder: Path) -> None:
-    """Rename an existing folder to NAME.1, NAME.2, …, and tell the user."""
+    """Rename an existing folder to the first free one of NAME.1, NAME.2, …, and print the new name."""
     aside = next(p for n in range(1, 10**6) if not (p := folder.with_name(f"{folder.name}.{n}")).exists())
     folder.rename(aside)
     print(f"The results that were in {folder}/ are now in {aside}/")
 
 
 def save(folder: Path, result: FitResult) -> None:
-    """Write all results of a fit into a folder. If the folder contains earlier results, it is renamed first.
+    """Write all results of a fit into `folder`. If the folder contains earlier results, it is renamed first.
 
-    If the capture was made from arrays, it is written too, as capture/scene.xml in the folder. Raises InputError if a
-    file cannot be written, ValueError if a network is not registered.
+    A capture that was made from arrays is written, too, with its scene file capture/scene.xml in the folder. Raises
+    InputError if a file cannot be written, and ValueError if a network of the object has no registered name.
     """
     capture = result.given
     ring_state(result.ring)  # raises for networks without a name before anything is moved
@@ -97,20 +103,21 @@ def save(folder: Path, result: FitResult) -> None:
 
 
 def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
-    """Make the content of scene.xml for the results in `folder`, with the given calibration. Writes no file.
+    """Make the content of scene.xml for the results in `folder`: the given scene with the fitted object.
 
-    Raises InputError if the scene cannot be rewritten.
+    Writes no file. The calibration stays as given. Paths are relative to `folder`. Raises InputError if the scene
+    cannot be rewritten.
     """
     return fitted_scene_xml(capture.path, folder, ring.subdivisions, ring.bsdf)
 
 
 def write_log(folder: Path, entries: Iterable[dict]) -> None:
-    """Write log.jsonl into `folder`, with these entries only."""
+    """Write log.jsonl into `folder`, one line for each entry. An existing file is replaced."""
     write_file(folder / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries))
 
 
 def add_to_log(folder: Path, entry: dict) -> None:
-    """Append an entry to log.jsonl in `folder`. Raises InputError if that fails."""
+    """Append an entry to log.jsonl in `folder` as a line. Raises InputError if the file cannot be written."""
     path = folder / "log.jsonl"
     with writing(path), path.open("a") as file:
         file.write(json.dumps(entry) + "\n")
@@ -126,7 +133,10 @@ def read_log(folder: Path) -> list[dict]:
 
 
 def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
-    """Write inputs.png to `path`: photographs with the start surface in green. It shows wrong masks and poses."""
+    """Write a contact sheet: photographs with the start surface in green. It makes wrong masks and poses visible.
+
+    `path`: the PNG file. `start`: the start surface, ready for rendering.
+    """
     some = capture.spread()
     columns = min(10, len(some))
     cell, line = 160, 16
@@ -146,9 +156,10 @@ def write_inputs(path: Path, capture: Capture, start: Surface) -> None:
 
 
 def write(folder: Path, result: FitResult, scene: bytes) -> None:
-    """Write ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, finished or not.
+    """Write ring.pt, mesh.ply, scene.xml, calibration.json and report.html of a fit, which may be unfinished.
 
-    `folder`: an existing results folder. `scene`: result of `fitted_scene`; this function adds the calibration.
+    Also writes masks and an environment map if the fit refined them. `folder`: an existing results folder. `scene`:
+    scene file (XML) with the fitted object and the given calibration; this function puts in what the fit refined.
     """
     ring, capture = result.ring, result.capture
     write_state(ring_state(ring, result.settings), folder / "ring.pt")
@@ -176,9 +187,10 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
 
 
 def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[int, str]:
-    """Write the masks of photographs `index` as PNG files into `folder`: NAME.png for the photograph NAME.
+    """Write masks as PNG files into `folder`: NAME.png for a photograph NAME.
 
-    Returns the file names by index. They are relative to the parent of `folder`.
+    `index`: indices of the photographs whose masks are written. Returns the file names with these indices as keys. They
+    are relative to the parent of `folder`.
     """
     names = {}
     for k in index:
@@ -193,7 +205,10 @@ def write_masks(folder: Path, capture: Capture, index: Iterable[int]) -> dict[in
 
 
 def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> bytes | None:
-    """Make the GLB file for the viewer in the report. Returns its bytes. If that fails, prints why and returns None."""
+    """Make the GLB file for the viewer in the report. Returns its bytes. If that fails, prints why and returns None.
+
+    `views`: cameras and masks of photographs; the file then marks the vertices that one of them shows. None: no marks.
+    """
     level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
     try:
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)

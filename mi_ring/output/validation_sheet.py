@@ -1,4 +1,4 @@
-"""Draws the contact sheet of mi-ring validate, the comparison with the path tracer."""
+"""Draws the contact sheet of mi-ring validate, which compares mi_ring's own renderer with Mitsuba's path tracer."""
 
 import numpy as np
 from matplotlib import colormaps
@@ -14,9 +14,10 @@ LEGEND = "Each photograph by its own exposure. Differences: red where photometri
 
 
 def strip(row: Comparison, pictures: Pictures) -> Image.Image:
-    """Draw the row of one photograph: its `pictures` side by side, with the numbers of `row`.
+    """Draw a row of the sheet for one photograph: pictures side by side, with the numbers of `row` above them.
 
-    Each row has its own exposure. Differences are red where photometric is brighter, otherwise blue.
+    `pictures`: renderings by mi_ring's own renderer, photometric, and by Mitsuba's path tracer. Each row has its own
+    exposure. Differences are red where photometric is brighter, and blue where it is darker.
     """
     photometric, unshadowed, path, direct = (p.mean(0) for p in vars(pictures).values())
     white = np.quantile(path[path > 0], 0.98) if (path > 0).any() else 1.0
@@ -49,7 +50,10 @@ def strip(row: Comparison, pictures: Pictures) -> Image.Image:
 
 
 def validation_sheet(strips: list[Image.Image]) -> bytes:
-    """Arrange the rows from `strip` in a contact sheet that is about square. Returns the bytes of a PNG file."""
+    """Arrange the rows of all photographs in a contact sheet that is about square. Returns the bytes of a PNG file.
+
+    `strips`: a picture for each row, at least one.
+    """
     width, height = strips[0].width + 12, max(line.height for line in strips)
     stacks = max(1, round(np.sqrt(len(strips) * height / width)))
     rows = -(-len(strips) // stacks)

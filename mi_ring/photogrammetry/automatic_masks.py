@@ -1,4 +1,4 @@
-"""Automatic masks: a first guess, then in turn GrabCut in each photograph and a vote of all masks on voxels.
+"""Automatic masks: from a first guess, GrabCut in each photograph and a vote of all masks on voxels alternate.
 
 A voxel stays if it is in the masks of most photographs that show it. The vote removes lamps and highlights, because
 these are in few masks. It also empties a concavity that some masks fill, for example with a shadow.
@@ -32,7 +32,7 @@ MIN_RADIANCE = 1e-3  #: lower radiance counts as this
 
 
 class RefinementSettings(NamedTuple):
-    """Settings of `refine_masks`: agreement needed in the vote, width of GrabCut's band, number of rounds."""
+    """Settings for the refinement of masks by votes on voxels and GrabCut in turn."""
 
     agreement: float  #: share of the masks that must contain a voxel
     band: float  #: width of the band around the silhouette in which GrabCut decides [object's size]
@@ -47,7 +47,7 @@ OUTLINES = RefinementSettings(0.96, 0.04, 2)
 
 @dataclass
 class VoxelObject:
-    """The object as a set of voxels in a grid."""
+    """The object as a set of voxels in a regular grid, in the frame of the cameras."""
 
     corner: np.ndarray  #: (3,) centre of the first voxel
     spacing: float
@@ -59,20 +59,23 @@ class VoxelObject:
         return self.corner + self.spacing * np.argwhere(self.voxels)
 
     def silhouette(self, view: ReducedView) -> np.ndarray:
-        """Project the voxels to a view. Returns a mask (H, W) uint8, 1 where the view shows the object."""
+        """Project the voxels to a view. Returns a mask (H, W) uint8: 1 where the view shows the object, otherwise 0."""
         row, column, inside = view.project(self.points)
         mask = np.zeros(view.valid.shape, np.uint8)
         mask[row[inside], column[inside]] = 1
         return cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disk(self.voxel_pixels(view) + 1))
 
     def voxel_pixels(self, view: ReducedView) -> float:
-        """Return the width of a voxel in a view [px]."""
+        """Return the width of a voxel in a view [px], at the median distance of the object."""
         distance = np.median(np.linalg.norm(self.points - view.camera.position, axis=1))
         return float(self.spacing * view.camera.focal.mean() / distance)
 
 
 class VoxelGrid:
-    """A cube of voxels around `center` (3,), and the views that see it. The cube's edges are 2 · `half_size` long."""
+    """A cube of voxels, and the views that show it.
+
+    `center` (3,): centre of the cube. `half_size`: half of its side length.
+    """
 
     def __init__(self, views: Views, center: np.ndarray, half_size: float) -> None:
         self.views, self.center, self.half_size = views, center, half_size
@@ -83,12 +86,12 @@ class VoxelGrid:
 
     @property
     def camera_distance(self) -> float:
-        """Median distance of the cameras from the centre."""
+        """Median distance of the cameras from the centre of the cube."""
         return float(np.median([np.linalg.norm(view.camera.position - self.center) for view in self.views]))
 
     @classmethod
     def seen_by(cls, views: Views) -> "VoxelGrid":
-        """Make a grid around the point at which the cameras look. It is large enough to fill the median photograph."""
+        """Make a grid around the point at which most cameras look. It is large enough to fill a typical photograph."""
         cameras = [view.camera for view in views]
         origins = np.stack([camera.position for camera in cameras])
         center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), "cameras")
@@ -97,15 +100,16 @@ class VoxelGrid:
 
     @classmethod
     def around(cls, views: Views, found: VoxelObject) -> "VoxelGrid":
-        """Make a grid around the object `found`. The grid is a little larger than the object."""
+        """Make a grid around the object `found`, a little larger than the object, for other views of it."""
         low, high = found.points.min(0), found.points.max(0)
         return cls(views, (low + high) / 2, 0.6 * float((high - low).max()) + found.spacing)
 
     def vote(self, masks: Masks, agreement: float, voters: Sequence[bool] | None = None) -> VoxelObject | None:
         """Find the object by a vote of the masks: the largest connected component of voxels that most masks contain.
 
-        Returns None if this component is too small. `agreement`: share of the masks that must contain a voxel.
-        `voters`: for each mask, whether it votes; None: all vote.
+        `masks`: one per view of the grid, (H, W), above 0 inside. `agreement`: a share, 0 to 1. Of the masks whose
+        views show a voxel, this share must contain it. `voters`: for each mask, whether it votes; None: all vote.
+        Returns None if the component has too few voxels.
         """
         yes, shown = np.zeros((2, len(self.points)), np.int16)
 
@@ -125,23 +129,23 @@ class VoxelGrid:
 
 
 def empty_masks(views: Views) -> list[np.ndarray]:
-    """Return a mask (H, W) uint8 of zeros for each view."""
+    """Return for each view a mask (H, W) uint8 that is 0 everywhere."""
     return [np.zeros(view.valid.shape, np.uint8) for view in views]
 
 
 def bright_mask(view: ReducedView) -> np.ndarray:
-    """Return a mask (H, W) uint8 of bright pixels: 1 where the log radiance is above Otsu's threshold.
+    """Return a mask (H, W) uint8 of the bright pixels of a view: 1 where the log radiance is above Otsu's threshold.
 
-    These pixels are near the flash.
+    Bright pixels show what is near the flash.
     """
     log = np.log(np.maximum(view.linear.max(-1), MIN_RADIANCE))
     return (log > threshold_otsu(log)).astype(np.uint8)
 
 
 def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
-    """Return for each view whether its mask is complete. `silhouettes`: those of the object that the masks agree on.
+    """Return a list of bool for the views: True if the view's mask covers its silhouette about as well as others do.
 
-    A complete mask misses about as little of its silhouette as the other masks do of theirs.
+    `masks`, `silhouettes`: one per view, (H, W). A silhouette is the projection of the object that all masks agree on.
     """
     missing = [
         (silhouette > mask)[view.valid].sum() / max(1, silhouette.sum())
@@ -151,7 +155,7 @@ def are_complete(views: Views, masks: Masks, silhouettes: Masks) -> list[bool]:
 
 
 class Segmentation(NamedTuple):
-    """Result of `refine_masks`: the object as voxels, and the mask in each view."""
+    """The object as voxels, with a mask in each view and the agreement of both."""
 
     masks: list[np.ndarray]  #: (H, W) uint8, 1 the object
     object: VoxelObject
@@ -163,9 +167,9 @@ def refine_masks(
 ) -> Segmentation | None:  # fmt: skip
     """Refine masks by two steps in turn: the masks of all views vote on the object, and GrabCut finds new masks.
 
-    GrabCut starts from the silhouettes of the object. `guesses`: for each view, an array (H, W) above 0 on the guessed
-    object. `backgrounds`: for each view, an array (H, W) above 0 where the object certainly is not. Returns None if the
-    masks do not agree on any object.
+    GrabCut starts from the silhouettes of the object. `guesses`: for each view of `grid`, an array (H, W) above 0 on
+    the guessed object. `backgrounds`: for each view, an array (H, W) above 0 where the object certainly is not. Returns
+    None if the masks do not agree on any object.
     """
 
     def outline(view: ReducedView, silhouette: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -188,23 +192,23 @@ def refine_masks(
 
 
 def resize_mask(mask: np.ndarray, view: ReducedView) -> np.ndarray:
-    """Resize a mask (h, w) to the size of the view. Returns (H, W) bool."""
+    """Resize a mask (h, w) of 0 and 1 to the size of a view. Returns (H, W) bool: True inside."""
     return cv2.resize(mask.astype(np.float32), view.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def disputed_pixels(mask: np.ndarray, silhouette: np.ndarray, tolerance: float) -> np.ndarray:
     """Return a mask (H, W) uint8: 1 where `mask` and `silhouette` differ by more than `tolerance` [px].
 
-    Such pixels often show a shadow.
+    `mask`, `silhouette` (H, W) uint8: above 0 inside. Such pixels often show a shadow.
     """
     wide, narrow = cv2.dilate(silhouette, disk(tolerance)), cv2.erode(silhouette, disk(tolerance))
     return ((mask > 0) & (wide == 0)).astype(np.uint8) | ((mask == 0) & (narrow > 0)).astype(np.uint8)
 
 
 def touching_pixels(mask: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Return a mask (H, W) uint8 of those parts of `guess` that are outside `mask` and touch it.
+    """Return a mask (H, W) uint8: 1 on pieces of `guess` that lie outside `mask` but touch it.
 
-    For example, such a part is a rod that holds the object.
+    `mask`, `guess` (H, W) uint8: above 0 inside. For example, such a piece is a rod that holds the object.
     """
     labels, _ = pieces((guess > 0) & (mask == 0))
     touching = np.unique(labels[cv2.dilate(mask, disk(2)) > 0])

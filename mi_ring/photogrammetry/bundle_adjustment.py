@@ -1,4 +1,4 @@
-"""Bundle adjustment of a model (`pycolmap.Reconstruction`), with the corners of the printed sheet as points."""
+"""Bundle adjustment of COLMAP's models (`pycolmap.Reconstruction`), with corners of the printed sheet as points."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -22,10 +22,10 @@ ITERATIONS = 10  #: of the solver per call; a call of pycolmap cannot be interru
 
 
 def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, progress: Progress) -> Any:
-    """Bundle-adjust a model, and return the adjusted model.
+    """Bundle-adjust a COLMAP model with a robust loss, and refine principal points. Returns the adjusted model.
 
-    The sheet's corners are used as points. But if they increase the error of the image features too much, they are
-    ignored.
+    `detections`: corners of the printed sheet by the photograph's name; they are used as points, unless they increase
+    the error of the image features too much. Empty: no sheet. `model` is changed.
     """
     model.tear_down()  # covariances are refused if an image has no pose
     list(progress(robust_adjustment(model), "bundle adjustment"))
@@ -43,9 +43,10 @@ def adjust(model: Any, pictures: Sequence[Picture], detections: Detections, prog
 
 
 def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections) -> list[int]:
-    """Add the sheet's corners to a model, each as `CORNER_WEIGHT` equal points. Returns the ids of these points.
+    """Add the sheet's corners as points to a COLMAP model, which is changed. Returns the ids of the new points.
 
-    `model` is changed.
+    `detections`: corners by the photograph's name. Each corner becomes `CORNER_WEIGHT` equal points, because it is more
+    precise than an image feature.
     """
     seen: dict[int, list[tuple[Any, np.ndarray]]] = {}
     for image, picture, scale in registered(model, pictures):
@@ -64,9 +65,9 @@ def add_corners(model: Any, pictures: Sequence[Picture], detections: Detections)
 
 
 def robust_adjustment(model: Any) -> Iterator[None]:
-    """Bundle-adjust a model with a robust loss, and remove outliers. `model` is changed.
+    """Bundle-adjust a COLMAP model with a robust loss, and remove outliers. `model` is changed.
 
-    Yields before each call of the solver.
+    It is an iterator for a progress bar: it yields None before each call of the solver, and the caller must exhaust it.
     """
     observations = pycolmap.ObservationManager(model)
     for _ in range(3):
@@ -76,7 +77,7 @@ def robust_adjustment(model: Any) -> Iterator[None]:
 
 
 def adjustment_problem(model: Any) -> tuple[Any, Any]:
-    """Return (options, configuration) for a bundle adjustment of all images of a model, with a robust loss."""
+    """Return COLMAP's (options, configuration) for a bundle adjustment of all images with poses, with a robust loss."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.solver_options.function_tolerance = CONVERGED
@@ -89,7 +90,11 @@ def adjustment_problem(model: Any) -> tuple[Any, Any]:
 
 
 def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
-    """Call the solver until it converges, at most `calls` times. `model` is changed. Yields before each call."""
+    """Call COLMAP's solver until it converges, at most `calls` times. `model` is changed.
+
+    It is an iterator for a progress bar: it yields None before each call, and the caller must exhaust it. `options`,
+    `config`: COLMAP's objects for the bundle adjustment.
+    """
     for _ in range(calls):
         yield
         summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
@@ -98,9 +103,10 @@ def solve(model: Any, options: Any, config: Any, calls: int) -> Iterator[None]:
 
 
 def refine_principal_points(model: Any, progress: Progress) -> Any:
-    """Refine the principal points of a model, and return the refined model.
+    """Refine the principal points of a COLMAP model by bundle adjustment. Returns the refined model.
 
-    If the data do not determine the principal point of a camera well, it keeps its value.
+    `model` does not change. If the data do not determine the principal point of a camera well, this point keeps its
+    value. Returns `model` itself if this is so for all cameras.
     """
     lenses = {model.images[k].camera_id for k in model.reg_image_ids()}
     fixed: set[int] = set()
@@ -121,9 +127,9 @@ def refine_principal_points(model: Any, progress: Progress) -> Any:
 
 
 def is_determined(camera: Any, covariance: Any) -> bool:
-    """Return whether the principal point of a camera is well determined.
+    """Return True if a bundle adjustment determines the principal point of a camera well.
 
-    `covariance`: a `pycolmap.BACovariance`; None if it could not be computed, which counts as not determined.
+    `covariance`: `pycolmap.BACovariance` of the adjustment; None: it could not be computed, so the result is False.
     """
     own = covariance and covariance.get_other_params_cov(camera.params)
     if own is None:
@@ -133,9 +139,9 @@ def is_determined(camera: Any, covariance: Any) -> bool:
 
 
 def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, Picture, int]]:
-    """Yield (image, photograph, factor) for each image of the model that has a pose.
+    """Yield (image of the model, photograph, factor) for each image of a COLMAP model that has a pose.
 
-    The photograph is `factor` times as large as the image.
+    The photograph is `factor` times as wide as the image, a whole number.
     """
     by_file = {grey_file(picture): picture for picture in pictures}
     for image in [model.images[k] for k in model.reg_image_ids()]:
@@ -144,9 +150,9 @@ def registered(model: Any, pictures: Sequence[Picture]) -> Iterator[tuple[Any, P
 
 
 def model_cameras(model: Any, pictures: Sequence[Picture]) -> dict[str, tuple[Lens, np.ndarray]]:
-    """Return the cameras of a model: a dict from names of photographs to (lens, camera-to-world pose (4, 4)).
+    """Return the cameras of a COLMAP model: (lens, camera-to-world pose (4, 4)), by the photograph's name.
 
-    The lens is that of the photograph at full size. Photographs without a pose are left out.
+    The lens is for the photograph at full size. Photographs without a pose are left out. Camera axes are OpenCV's.
     """
     cameras = {}
     for image, picture, scale in registered(model, pictures):

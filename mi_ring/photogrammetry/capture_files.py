@@ -43,10 +43,10 @@ class PosedPicture:
 
 
 def crop_windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, int]]) -> list[Window]:
-    """Choose a window around the object in each photograph. `sizes`: (width, height) [px] of the photographs.
+    """Choose a window around the object in each photograph. Photographs of one size get windows of one size.
 
-    Photographs of one size get windows of one size, so that they can be rendered together. If none of these has a mask,
-    the windows are the whole photographs.
+    `masks`: one per photograph, full size or reduced; None: no mask. `sizes`: (width, height) of the photographs [px].
+    If no photograph of a size has a mask, its windows are whole photographs.
     """
     bounds = [None if mask is None else mask_bounds(mask, size) for mask, size in zip(masks, sizes)]
     windows = []
@@ -61,7 +61,10 @@ def crop_windows(masks: Sequence[np.ndarray | None], sizes: Sequence[tuple[int, 
 
 
 def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> Element:
-    """Write the crop and the masks of a photograph. Returns the photograph's XML element for the scene file."""
+    """Write the undistorted crop and the masks of a photograph. Returns its XML element for the scene file.
+
+    `window`: the crop in the undistorted photograph. `writer`: writes the files of the capture.
+    """
     picture = posed.picture
     pixels = picture.pixels[..., :3]
     left, top, width, height = window[:4]
@@ -91,9 +94,10 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
 def write_table(
     writer: Writer, pictures: Sequence[PosedPicture], plane: Plane, center: np.ndarray, flash: FlashCalibration
 ) -> list[Element]:
-    """Write a texture of the table's albedo around `center` (3,).
+    """Estimate the albedo of the table around `center` (3,), and write it as a texture.
 
-    Returns a list with the XML element of the table. The list is empty if no photograph shows the table.
+    Returns a list with the XML element of the table; the list is empty if no photograph shows the table. `pictures`:
+    the photographs. `plane`: the table. `flash`: light and camera response, calibrated with the sheet.
     """
 
     def observe(posed: PosedPicture) -> tuple[ReducedView, np.ndarray, Light]:
@@ -118,9 +122,9 @@ def write_table(
 
 
 def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the lowest and highest (column, row) of the object, (2, 2) [px of the photograph].
+    """Return the bounding box of the object in a mask: lowest and highest (column, row), (2, 2) [px of the photograph].
 
-    `size`: (width, height) [px] of the photograph. Returns None if the mask is empty.
+    `size`: (width, height) of the photograph [px]; the mask may be reduced. Returns None if the mask is empty.
     """
     rows, columns = np.nonzero(mask == OBJECT)
     if not len(rows):
@@ -129,14 +133,17 @@ def mask_bounds(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
 
 
 def reduction(mask: np.ndarray, size: tuple[int, int]) -> int:
-    """Return how many times larger a photograph is than its mask. `size`: (width, height) [px] of the photograph."""
+    """Return the whole number by which a mask is smaller than its photograph.
+
+    `size`: (width, height) of the photograph [px].
+    """
     return round(size[0] / mask.shape[1])
 
 
 def crop_mask(mask: np.ndarray, size: tuple[int, int], window: Window) -> np.ndarray:
-    """Enlarge a mask to its photograph, and crop it to a window. The result has the values `OBJECT`, `UNKNOWN` and 0.
+    """Enlarge a reduced mask to the size of its photograph, and crop it to a window. Returns (height, width) integers.
 
-    `size`: (width, height) [px] of the photograph.
+    Values are `OBJECT`, `UNKNOWN` and 0 (background). `size`: (width, height) of the photograph [px].
     """
     scale, (left, top, width, height) = reduction(mask, size), window[:4]
     to_mask = np.array([[1, 0, left + (1 - scale) / 2], [0, 1, top + (1 - scale) / 2]]) / scale

@@ -27,15 +27,16 @@ OTHER_MATERIAL = 0.1  #: the margin is not paper if its log intensity differs fr
 
 
 class ObjectSphere(NamedTuple):
-    """A sphere that stands for the object. It reflects light onto the paper, and it blocks light of the room."""
+    """A sphere that stands for the object: it reflects light onto the paper, and it blocks the light of the room."""
 
     center: np.ndarray  #: (3,)
     radius: float
 
     def reflected(self, points: np.ndarray, lights: np.ndarray) -> np.ndarray:
-        """Return the irradiance (n,) at `points` (n, 3) from light that a white sphere reflects.
+        """Return the irradiance (n,) of the paper by light that the sphere reflects, for a white sphere.
 
-        `lights` (n, 3): for each point, the position of the light of intensity 1 that lights the sphere.
+        `points` (n, 3): points of the paper. `lights` (n, 3): for each point, the position of the flash, of intensity
+        1.
         """
         up, to_light = self.center - points, lights - self.center
         distance = np.linalg.norm(to_light, axis=1)
@@ -44,7 +45,10 @@ class ObjectSphere(NamedTuple):
         return 2 / 3 * lit * self.form_factor(points) / distance**2
 
     def form_factor(self, points: np.ndarray) -> np.ndarray:
-        """Return the form factors (n,) of the sphere, seen from `points` (n, 3) of the sheet."""
+        """Return the form factors (n,) of the sphere: which share of uniform room light it blocks at each point.
+
+        `points` (n, 3): points of the sheet.
+        """
         up = self.center - points
         distance = np.linalg.norm(up, axis=1)
         return ((self.radius / distance) ** 2 * np.maximum(up[:, 2], 0) / distance).clip(max=1)
@@ -62,16 +66,16 @@ class FlashCalibration(NamedTuple):
 
     @property
     def ambient(self) -> np.ndarray:
-        """Radiance (3,) of uniform room light, at the median exposure."""
+        """Radiance (3,) of the room, as if it were uniform, at the median exposure."""
         return self.room / np.pi * self.power
 
 
 def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, falloff: float) -> np.ndarray:
-    """Return the irradiance (n,) at n surface points from a flash of intensity 1.
+    """Return the irradiance (n,) of n surface points by a flash of intensity 1.
 
     It is 0 where the flash is behind the surface. `to_light` (n, 3): vectors from the points to the flash. `normal`
-    (3,): surface normal. `forward` (3,) or (n, 3): axis of the flash. `falloff`: exponent of the cosine about this
-    axis.
+    (3,): unit surface normal. `forward` (3,) or (n, 3): unit axis of the flash. `falloff`: exponent of the cone;
+    intensity is proportional to the cosine of the angle to the axis ^ `falloff`.
     """
     distance = np.linalg.norm(to_light, axis=1)
     cosine = np.maximum(-(to_light * forward).sum(1) / distance, MIN_FLASH_COSINE)
@@ -79,7 +83,7 @@ def irradiance(to_light: np.ndarray, normal: np.ndarray, forward: np.ndarray, fa
 
 
 class Observations(NamedTuple):
-    """n samples of white paper, each with the pose of its camera and the axes of its flash."""
+    """n samples of white paper, each with the pose of its camera."""
 
     points: np.ndarray  #: (n, 3)
     colours: np.ndarray  #: (n, 3) logarithms
@@ -89,7 +93,7 @@ class Observations(NamedTuple):
 
 
 class FlashParameters(NamedTuple):
-    """The unknowns of a flash calibration that all photographs share; see `FlashCalibration`."""
+    """The unknowns of a flash calibration that all photographs share."""
 
     offset: np.ndarray
     falloff: float
@@ -99,9 +103,9 @@ class FlashParameters(NamedTuple):
     power: np.ndarray  #: logarithms
 
     def intensities(self, seen: Observations, sphere: ObjectSphere | None) -> np.ndarray:
-        """Return the log intensity (n, 3) of the flash, as each of the n samples in `seen` gives it on its own.
+        """Return the log intensity (n, 3) of the flash that explains each of n paper samples by these parameters.
 
-        `sphere`: stands for the object; None: no object.
+        `seen`: the samples. `sphere`: stands for the object; None: no object.
         """
         to_light, room = seen.poses[:, :3, 3] + seen.axes @ self.offset - seen.points, self.room
         light = irradiance(to_light, np.array([0.0, 0, 1]), seen.poses[:, :3, 2], self.falloff)[:, None]
@@ -117,12 +121,13 @@ def calibrate_flash(
 ) -> FlashCalibration | None:  # fmt: skip
     """Calibrate the flash from the brightness of white paper. Returns None if no photograph shows the paper.
 
-    The dicts have names of photographs as keys. `papers`: samples of the paper. `poses`: camera-to-world (4, 4).
-    `axes`: (3, 3), see `turn_with_cameras`. `exposures`: relative, NaN if unknown. `offset` (3,): approximate position
-    of the flash relative to the camera. `sphere`: stands for the object; None: no object. `curved`: also estimate the
-    camera's response.
+    The dictionaries have names of photographs as keys. `papers`: samples of the paper. `poses`: camera-to-world (4, 4),
+    in the sheet's frame [mm]. `axes`: rotations (3, 3) from the axes of `offset` to the pixel axes of the photograph.
+    `exposures`: relative exposures, NaN if unknown. `offset` (3,): approximate position of the flash relative to the
+    lens [mm]. `sphere`: stands for the object; None: no object. `curved`: True: also estimate the camera's response;
+    False: it is linear.
 
-    The method is robust least squares of log brightness, with priors. It estimates the `FlashParameters`, and the
+    The method is robust least squares of log brightness, with priors. It estimates what all photographs share, and the
     intensity of each photograph. Samples in the margin are used only if they are as bright as the squares. If the
     response is nearly linear, it is set to linear.
     """
@@ -161,7 +166,8 @@ def fit_parameters(
     """Estimate the unknowns that all photographs share. At most `MAX_PHOTOGRAPHS` photographs are used.
 
     `observations`: one per photograph. `prior`: (log exposures, their standard deviations), each (count,) for the
-    photographs. Other arguments: see `calibrate_flash`.
+    photographs. `offset` (3,): approximate position of the flash relative to the lens [mm]. `sphere`: stands for the
+    object; None: no object. `curved`: also estimate the camera's response; False: it is linear.
     """
     some = evenly_spaced(len(observations), MAX_PHOTOGRAPHS)
     exposures, deviations = (part[some, None] for part in prior)
@@ -201,9 +207,10 @@ def fit_intensities(
     observations: Sequence[Observations], prior: tuple[np.ndarray, np.ndarray], parameters: FlashParameters,
     sphere: ObjectSphere | None,
 ) -> np.ndarray:  # fmt: skip
-    """Return robust estimates of the log intensity of the flash in each photograph, (count, 3).
+    """Estimate the log intensity of the flash in each photograph, robustly. Returns (count, 3).
 
-    `prior`: see `fit_parameters`.
+    `observations`: one per photograph. `prior`: (log exposures, their standard deviations), each (count,).
+    `parameters`: what all photographs share. `sphere`: stands for the object; None: no object.
     """
     result = []
     for seen, exposure, deviation in zip(observations, *prior):

@@ -55,7 +55,10 @@ class Picture:
         return oriented(self.stored(), self.orientation)
 
     def stored(self) -> np.ndarray:
-        """Read the pixels as the file stores them. They are not turned upright."""
+        """Read the pixels (H, W, C) uint8 or uint16 as the file stores them, not turned upright. C is at least 3.
+
+        Raises InputError if the file cannot be read.
+        """
         pixels = read_as(self.path, "photograph", partial(read_image, heed=True))
         if pixels.dtype == np.float32:
             if not np.isfinite(pixels).all():
@@ -69,9 +72,10 @@ class Picture:
         return oriented(mask_values(read_as(self.path, "mask", read_image)), self.orientation)
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
-        """Open the file, and return the result of `read(opened)`.
+        """Open a raw or HEIF file, and return the result of `read(opened)`.
 
-        LibRaw opens raw files. Pillow opens all others, and turns HEIF upright.
+        `read`: takes LibRaw's object for a raw file, otherwise Pillow's image. Raises InputError if the file cannot be
+        read.
         """
         raw = self.suffix in RAW
         with (
@@ -82,7 +86,7 @@ class Picture:
 
     @cached_property
     def camera_orientation(self) -> int:
-        """EXIF orientation of the camera when it took the photograph, 1 to 8."""
+        """How the camera was held, as an EXIF orientation: 1 (upright) to 8."""
         if self.suffix in HEIF:
             return self.decode(lambda image: image.info.get("original_orientation") or 1)
         if self.suffix in RAW:
@@ -92,7 +96,7 @@ class Picture:
 
     @property
     def orientation(self) -> int:
-        """EXIF orientation by which `stored` must be turned; 1 (none) if `upright` is not set.
+        """EXIF orientation by which the stored pixels must be turned; 1 (not at all) if `upright` is False.
 
         It is also 1 for HEIF, because its reader has turned the pixels already.
         """
@@ -100,41 +104,41 @@ class Picture:
 
     @property
     def axes(self) -> np.ndarray:
-        """Rotation (3, 3) from the sensor's axes (x right, y down, z forward) to those of `pixels`."""
+        """Rotation (3, 3) from the axes of the sensor to the axes of `pixels`; both are x right, y down, z forward."""
         return orientation_axes(self.camera_orientation if self.upright or self.suffix in HEIF else 1)
 
     @cached_property
     def exif(self) -> Image.Exif:
-        """EXIF data. Empty if there are none, or if they cannot be read."""
+        """EXIF data of the file; empty if there are none, or if they cannot be read."""
         try:
             return exif_of(self.path)
         except Exception:  # damaged data raise many kinds; Pillow does not know all raw formats
             return Image.Exif()
 
     def exif_field(self, tag: int) -> Any:
-        """Return the value of the tag number `tag` in the Exif part of the EXIF data. Returns None if it is missing."""
+        """Return a value of the Exif section of the EXIF data; None if it is missing. `tag`: number of the tag."""
         return self.exif.get_ifd(ExifTags.IFD.Exif).get(tag)
 
     @property
     def raw(self) -> bool:
-        """True for a raw file. Its pixels are linear, and their brightness is arbitrary."""
+        """True for a raw file: its pixels are linear, with an arbitrary scale."""
         return self.suffix in RAW
 
     @cached_property
     def encoding(self) -> Encoding:
-        """Encoding of `pixels`: `linear` or `srgb`. If the file does not declare it, 8 bits are sRGB."""
+        """Encoding of `pixels`: "linear" or "srgb". If the file does not declare it, 8 bits are sRGB, others linear."""
         return read_as(self.path, "photograph", encoding_of)
 
     @cached_property
     def size(self) -> tuple[int, int]:
-        """Width and height of `pixels` [px]."""
+        """(width, height) of `pixels` [px]. It is read without the pixels."""
         size = image_size(self.path)
         return size[::-1] if self.orientation > 4 else size
 
     def grey(self, longest: int) -> np.ndarray:
-        """Return grey pixels (h, w) uint8, in which features are searched. They are reduced by block means.
+        """Return a reduced grey image (h, w) uint8, in which features are searched.
 
-        `longest`: largest length of the longer side [px].
+        `longest`: largest length of the longer side [px]. Pixels are means of square blocks.
         """
         rgb = self.srgb()
         scale = -(-max(rgb.shape[:2]) // longest)
@@ -142,7 +146,7 @@ class Picture:
         return np.array(Image.fromarray(rgb[:height, :width]).convert("L").reduce(scale))
 
     def srgb(self) -> np.ndarray:
-        """Return the photograph as sRGB, (H, W, 3) uint8."""
+        """Return the photograph as 8-bit sRGB, (H, W, 3) uint8. A raw file is scaled to a usual brightness."""
         rgb = self.pixels[:, :, :3]
         if rgb.dtype == np.uint8:
             return rgb
@@ -152,25 +156,28 @@ class Picture:
 
     @cached_property
     def white(self) -> float:
-        """Value of `pixels` that is shown as white (1 = full scale).
+        """The linear value of `pixels` that is shown as white (1 = full scale).
 
-        It is needed because the brightness of raw files is arbitrary. For other files, it is 1.
+        For a raw file, it is near the brightest pixel, because its scale is arbitrary. For other files, it is 1.
         """
         if not self.raw:
             return 1.0
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
     def to_linear(self, pixels: np.ndarray) -> np.ndarray:
-        """Convert a part of `pixels`, without alpha, to linear radiance (H, W, 3) float32. 1.0 is full scale."""
+        """Convert pixels, encoded as those of this photograph, to linear radiance. 1.0 is full scale.
+
+        `pixels`: a part of the array `pixels` without alpha, of any shape. Returns float32 of the same shape.
+        """
         value = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=np.float32) / np.iinfo(pixels.dtype).max
         return (value if self.encoding == "linear" else srgb_to_linear(value))[pixels]
 
     def mask(self, source: str | Path) -> np.ndarray | None:
-        """Return the user's mask (H, W) uint8, 255 on the object. Returns None if this photograph has none.
+        """Return the user's mask (H, W) uint8, 255 on the object; None if this photograph has none.
 
         `source`: "alpha": the mask is the alpha channel. "rembg": the package rembg makes it. Otherwise, `source` is a
-        folder of masks, see `mask_file`. Raises InputError if the mask cannot be read, or if its size is not that of
-        the photograph.
+        folder of mask files. Raises InputError if the mask cannot be read, or if its size is not that of the
+        photograph.
         """
         if source == "rembg":
             return np.array(rembg()(Image.fromarray(self.srgb())))
@@ -188,9 +195,10 @@ class Picture:
         return (mask // (np.iinfo(mask.dtype).max // 255)).astype(np.uint8)
 
     def mask_file(self, folder: Path) -> Path | None:
-        """Return the mask file of this photograph in `folder`. Returns None if there is no such file.
+        """Return the path of this photograph's mask file in `folder`; None if there is no such file.
 
-        For photo.jpg, it is photo.jpg.png, photo.png, photo_mask.png or mask_photo.png, or in another image format.
+        For photo.jpg, it is photo.jpg.png, photo.png, photo_mask.png or mask_photo.png, or one of these in another
+        image format.
         """
         suffixes = [own for suffix in (".png", *SUFFIXES) for own in (suffix, suffix.upper())]
         names = self.path.name, self.name, f"{self.name}_mask", f"mask_{self.name}"
@@ -204,7 +212,10 @@ class Picture:
 
 @cache
 def rembg() -> Callable[[Image.Image], Image.Image]:
-    """Load rembg's network. Returns the function that makes a mask. Raises InputError if rembg is not installed."""
+    """Load the network of the package rembg. Returns a function from an image to its mask.
+
+    Raises InputError if rembg is not installed.
+    """
     package = need("rembg", "--masks rembg")
     return partial(package.remove, session=package.new_session(), only_mask=True)
 
@@ -212,26 +223,27 @@ def rembg() -> Callable[[Image.Image], Image.Image]:
 def turn_with_cameras(pictures: Sequence[Picture], vector: np.ndarray) -> dict[str, np.ndarray]:
     """Convert a vector that is fixed to the camera to the pixel axes of each photograph. Returns vectors by name.
 
-    The camera may have been held in several orientations. `vector`: (3,), or (3, n) for n vectors. Its axes are those
-    of an upright photograph with the most frequent orientation.
+    The camera may have been held in several orientations. `vector` (3,), or (3, n) for n vectors: in the axes (x right,
+    y down, z forward) of a photograph with the most frequent orientation, shown upright.
     """
     usual, _ = Counter(picture.camera_orientation for picture in pictures).most_common(1)[0]
     return {p.name: p.axes @ orientation_axes(usual).T @ vector for p in pictures}
 
 
 def up_directions(pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
-    """Return the up direction (3,) of each photograph in its own pixel axes: a dict by the photograph's name.
+    """Return the up direction (3,) of each photograph in its pixel axes (x right, y down, z forward), by name.
 
-    Up is the direction that points up when the photograph is shown upright.
+    It is the direction that points up when the photograph is shown upright.
     """
     return {p.name: p.axes @ orientation_axes(p.camera_orientation).T @ [0, -1, 0] for p in pictures}
 
 
 def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
-    """List the photographs in a folder, sorted by name. `upright`: see `Picture`.
+    """List the photographs in a folder, sorted by name.
 
-    Raises InputError if the folder is missing, if a file name cannot be used, if there are too few photographs, or if
-    two of them are the same.
+    Of a raw file and a JPEG of the same name, only the raw file is listed. `upright`: turn pixels by the EXIF
+    orientation. Raises InputError if the folder is missing, if a file name cannot be used, if there are too few
+    photographs, or if two of them are the same.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: FOLDER: {'is a file' if folder.exists() else 'no such folder'}; give the folder "
@@ -271,22 +283,22 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
 
 
 def focal_35mm(pictures: Sequence[Picture]) -> float | None:
-    """Return the first 35 mm equivalent focal length [mm] in the EXIF data of the photographs; None without any."""
+    """Return the 35 mm equivalent focal length [mm] from EXIF data, of the first photograph that has one.
+
+    None if no photograph has one.
+    """
     values = (picture.exif_field(ExifTags.Base.FocalLengthIn35mmFilm) for picture in pictures)
     return next((float(value) for value in values if isinstance(value, int | float) and value > 0), None)
 
 
 def without_exposure(pictures: Sequence[Picture]) -> list[str]:
-    """Return the file names of photographs without an exposure in their EXIF data.
-
-    If no photograph has an exposure, the list is empty.
-    """
+    """Return the file names of photographs without an exposure in their EXIF data; empty if all lack it."""
     missing = [p.path.name for p, exposure in zip(pictures, exif_exposures(pictures)) if np.isnan(exposure)]
     return missing if len(missing) < len(pictures) else []
 
 
 def exif_exposures(pictures: Sequence[Picture]) -> np.ndarray:
-    """Return the exposures (N,) of the photographs by EXIF data: exposure time · ISO / aperture². NaN if unknown.
+    """Return the exposures (N,) from EXIF data: exposure time [s] · ISO / aperture². NaN if unknown.
 
     A value that all photographs lack, for example the aperture of an old lens, is taken as 1.
     """
@@ -294,7 +306,10 @@ def exif_exposures(pictures: Sequence[Picture]) -> np.ndarray:
 
 
 def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.ndarray:
-    """Return the exposures (N,) by EXIF data, divided by their median. `unknown`: value for photographs without one."""
+    """Return the exposures (N,) from EXIF data, divided by their median.
+
+    `unknown`: value for photographs without an exposure.
+    """
     exposures = exif_exposures(pictures)
     known = np.isfinite(exposures)
     return np.where(known, exposures / np.median(exposures[known]) if known.any() else 1.0, unknown)
@@ -303,7 +318,7 @@ def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.
 def without_flash(pictures: Sequence[Picture]) -> list[str]:
     """Return the file names of photographs whose flash did not fire, by EXIF data.
 
-    The list is empty if the flash fired in only half of the photographs or fewer.
+    The list is empty unless the flash fired in more than half of the photographs.
     """
     fired = [picture.exif_field(ExifTags.Base.Flash) for picture in pictures]
     off = [p.path.name for p, value in zip(pictures, fired) if isinstance(value, int) and not value & 1]
@@ -311,5 +326,5 @@ def without_flash(pictures: Sequence[Picture]) -> list[str]:
 
 
 def camera_names(pictures: Sequence[Picture]) -> dict[str, int]:
-    """Return the camera models in the EXIF data: a dict from the model to its number of photographs."""
+    """Count the photographs of each camera model in the EXIF data. Returns counts by the name of the model."""
     return dict(Counter(str(m) for picture in pictures if (m := picture.exif.get(ExifTags.Base.Model))))

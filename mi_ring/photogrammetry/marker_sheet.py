@@ -40,7 +40,10 @@ Pose = np.ndarray  #: (4, 4) camera-to-world, OpenCV's axes
 
 
 class SheetDetection(NamedTuple):
-    """The sheet's corners in one photograph. Sheet frame: origin in its middle, x right, y up, z out of the paper."""
+    """The sheet's corners that one photograph shows.
+
+    The sheet's frame has its origin in the middle, x right, y up, and z out of the paper.
+    """
 
     ids: np.ndarray  #: (n,) int, row by row from the top left
     points: np.ndarray  #: (n, 3) [mm], z = 0
@@ -52,7 +55,7 @@ Cameras = Mapping[str, tuple[Lens, Pose]]  #: by the photograph's name
 
 
 class Similarity(NamedTuple):
-    """The similarity x ↦ scale · rotation x + shift from the cameras' frame to the sheet's [mm], and its errors."""
+    """A similarity transform x ↦ scale · rotation x + shift from the cameras' frame to the sheet's frame [mm]."""
 
     scale: float
     rotation: np.ndarray  #: (3, 3)
@@ -62,15 +65,15 @@ class Similarity(NamedTuple):
 
 
 def charuco() -> cv2.aruco.CharucoBoard:
-    """Return the sheet as a ChArUco board of OpenCV."""
+    """Return the sheet as OpenCV's ChArUco board, with lengths in mm."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
     return cv2.aruco.CharucoBoard((COLUMNS, ROWS), SQUARE, MARKER * SQUARE, dictionary)
 
 
 def page(paper: Literal["a4", "letter"]) -> Image.Image:
-    """Draw the page to print: the sheet, and below it a line that says what to measure.
+    """Draw the page to print: the sheet, and below it a line that says what to measure. Writes no file.
 
-    The page has `DOTS` pixels per mm. No file is written.
+    The image has `DOTS` pixels per mm. `paper`: size of the page.
     """
     size = DOTS * SQUARE * np.array([COLUMNS, ROWS])
     sheet = Image.new("1", (round(DOTS * PAPERS[paper][0]), round(DOTS * PAPERS[paper][1])), 1)
@@ -94,7 +97,10 @@ class MarkerSheet:
         self.detector = cv2.aruco.CharucoDetector(charuco(), params)
 
     def detect(self, picture: np.ndarray) -> SheetDetection | None:
-        """Find the sheet's corners in a photograph (H, W, 3) or (H, W) uint8. Returns None if it shows too few."""
+        """Find the sheet's corners in a photograph (H, W, 3) or (H, W) uint8.
+
+        Returns None if the photograph shows too few of them. Their pixels are refined at full size.
+        """
         grey = picture if picture.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
         scale = -(-max(grey.shape) // LONGEST)
         height, width = (side // scale for side in grey.shape)
@@ -119,7 +125,7 @@ class MarkerSheet:
         return SheetDetection(ids, points, pixels)
 
     def pitch(self, points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Return the length (n,) [px] of a square's shorter side at each of n corners.
+        """Return how long a square's side appears at each of n corners, (n,) [px]: the shorter of two sides.
 
         `points` (n, 3): the corners on the sheet. `pixels` (n, 2): the same corners in the photograph.
         """
@@ -134,16 +140,17 @@ class MarkerSheet:
 
 
 def are_collinear(points: np.ndarray) -> bool:
-    """Return whether points (n, 3) are nearly on one line."""
+    """Return True if points (n, 3) are nearly on one line."""
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(values[1] <= 0.01 * values[0])
 
 
 def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict[str, Pose], dict[str, float]]:
-    """Calibrate photographs of one `size` (width, height) [px] by the sheet alone.
+    """Calibrate photographs of one size by the sheet alone. Returns (lens, poses, errors).
 
-    Returns (lens, poses [mm], RMS reprojection errors [px]). The last two are dicts by the photograph's name. The lens
-    is SIMPLE_RADIAL with its principal point in the middle. Photographs that do not fit are left out. Raises InputError
+    `poses` are camera-to-world (4, 4) [mm], `errors` RMS reprojection errors [px], both by the photograph's name. The
+    lens has one radial coefficient, and its principal point is in the middle. `detections`: corners by the photograph's
+    name. `size`: (width, height) of the photographs [px]. Photographs that do not fit are left out. Raises InputError
     if fewer than three fit.
     """
     names = list(detections)
@@ -171,9 +178,10 @@ def calibrate(detections: Detections, size: tuple[int, int]) -> tuple[Lens, dict
 
 
 def align(detections: Detections, cameras: Cameras) -> Similarity:
-    """Estimate the similarity transform from the cameras' frame to the sheet's frame.
+    """Estimate the similarity transform from the cameras' frame to the sheet's frame [mm].
 
-    Raises InputError if too few corners fit.
+    `detections`: corners by the photograph's name. `cameras`: (lens, pose) by the photograph's name. Raises InputError
+    if too few corners fit, or if they fit badly.
     """
     seen = np.array([pair for _, *pair in triangulate(detections, cameras)]).reshape(-1, 2, 3)
     found, true = seen[:, 0], seen[:, 1]
@@ -195,7 +203,11 @@ def align(detections: Detections, cameras: Cameras) -> Similarity:
 
 
 def triangulate(detections: Detections, cameras: Cameras) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Triangulate the sheet's corners. Yields (id, point (3,) in the cameras' frame, point (3,) on the sheet [mm])."""
+    """Triangulate the sheet's corners. Yields (id, point (3,) in the cameras' frame, point (3,) on the sheet [mm]).
+
+    `detections`: corners by the photograph's name. `cameras`: (lens, pose) by the photograph's name. Corners that are
+    seen by only one camera or without parallax are left out.
+    """
     options = pycolmap.EstimateTriangulationOptions(min_tri_angle=MIN_PARALLAX)
     options.ransac.random_seed = 0
     seen: dict[int, list[tuple]] = {}
@@ -214,7 +226,7 @@ def triangulate(detections: Detections, cameras: Cameras) -> Iterator[tuple[int,
 
 
 class PaperSamples(NamedTuple):
-    """Samples of the sheet's white paper in a photograph."""
+    """Brightness samples of the sheet's white paper in a photograph."""
 
     points: np.ndarray  #: (n, 3) on the sheet, in the frame of `SheetDetection`
     colours: np.ndarray  #: (n, 3) linear
@@ -224,10 +236,10 @@ class PaperSamples(NamedTuple):
 def sample_paper(
     photograph: np.ndarray, detection: SheetDetection, linear: Callable[[np.ndarray], np.ndarray] = np.asarray
 ) -> PaperSamples:
-    """Sample the colours of the white squares and of the margin in a photograph (H, W, 3).
+    """Sample the colours of the sheet's white squares and of the page's margin in a photograph (H, W, 3).
 
-    Each sample is a median. Samples above `CLIPPED` are left out. `linear`: function that decodes a part of the
-    photograph to linear float32. The whole photograph at once would need too much memory.
+    Each sample is a median of several pixels. Overexposed samples are left out. `linear`: function that decodes a part
+    of the photograph to linear float32; it is called for parts because the whole would need too much memory.
     """
 
     def sample(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
@@ -266,7 +278,7 @@ def sample_colours(
     """Return the linear colours (n, 3) of a photograph (H, W, 3) at `points` (n, 2) of a plane.
 
     A colour is NaN if its point is outside the photograph. `plane` (3, 3): homography from the plane to pixels.
-    `linear`: see `sample_paper`.
+    `linear`: function that decodes a part of the photograph to linear float32.
     """
     at = cv2.perspectiveTransform(points[None], plane) - 0.5
     height, width = photograph.shape[:2]

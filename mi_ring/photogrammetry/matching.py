@@ -1,4 +1,7 @@
-"""Finds image features with COLMAP's library, and matches them between photographs with matrix products."""
+"""Finds image features with COLMAP's library, and matches them between photographs with matrix products.
+
+Features and matches are kept in COLMAP's database, in which an image is the reduced grey file of a photograph.
+"""
 
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -40,15 +43,20 @@ STATIC, MAX_STATIC = 0.01, 0.9
 
 
 def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Write reduced grey images to the folder `folder`/grey, and their features to `folder`/database.db.
+    """Find the image features of photographs. Shows a progress bar.
 
-    Images that have features in the database already are skipped.
+    Writes reduced grey images to `folder`/grey, and features to the COLMAP database `folder`/database.db. Images that
+    have features there already are skipped.
     """
     list(progress(extract_features(pictures, folder), "features", len(pictures)))
 
 
 def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Picture]:
-    """Do the same as `find_features`, and yield each photograph when its features are in the database."""
+    """Find the image features of photographs. Yields each photograph when its features are in the database.
+
+    Writes reduced grey images to `folder`/grey, and features to the COLMAP database `folder`/database.db. Images that
+    have features there already are yielded, too, without work.
+    """
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=cores())
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
     database, grey = folder / "database.db", folder / "grey"
@@ -78,20 +86,17 @@ def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Pict
 
 
 def batches(things: Sequence[Any], count: int) -> Iterator[Sequence[Any]]:
-    """Split a sequence into parts of `count` items. The last part may be shorter."""
+    """Split a sequence into parts of `count` items each. The last part may be shorter."""
     return (things[k : k + count] for k in range(0, len(things), count))
 
 
 def grey_file(picture: Picture) -> str:
-    """Return the file name of the photograph's grey image.
-
-    It has no spaces, because COLMAP's lists of pairs separate names by spaces.
-    """
+    """Return the file name of a photograph's reduced grey image. It has no spaces, which COLMAP does not allow."""
     return f"{quote(picture.name, safe='')}.png"
 
 
 def camera_ids(database: Path) -> dict[str, int]:
-    """Return the camera ids of the images in COLMAP's database: a dict by file name. Empty if there is no database."""
+    """Return the camera ids of the images in a COLMAP database, by file name; empty if there is no such file."""
     if not database.is_file():
         return {}
     with pycolmap.Database.open(database) as opened:
@@ -108,7 +113,7 @@ class Features(NamedTuple):
 
 
 def read_features(database: Path) -> dict[str, Features]:
-    """Read the features of all images in COLMAP's database. Returns a dict by file name."""
+    """Read the features of all images in a COLMAP database. Returns them by file name."""
     with pycolmap.Database.open(database) as opened:
         cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
         return {
@@ -121,10 +126,10 @@ def read_features(database: Path) -> dict[str, Features]:
 
 
 def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Find, for each descriptor (n, 128), the nearest of the `others` (m, 128). Returns (indices (n,), ratios (n,)).
+    """Find for each of n descriptors the nearest of m others. Returns (indices (n,) into `others`, ratios (n,)).
 
-    A ratio is the angle to the nearest one, divided by the angle to the second nearest one. If the angle to the nearest
-    one is too large for a match, the ratio is infinite. Products of integers are exact in float32.
+    `descriptors` (n, 128), `others` (m, 128), uint8. A ratio is the angle to the nearest descriptor, divided by the
+    angle to the second nearest one. It is infinite if the angle to the nearest one is too large for a match.
     """
     others = torch.cat([others.float(), torch.zeros(1, others.shape[1])])  # the second nearest one if there is only one
     buffer, found = torch.empty(BLOCK, len(others)), []  # new memory for each block would take longer than its product
@@ -138,10 +143,10 @@ def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tens
 
 
 def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Find descriptors (n, 128) and (m, 128) that are nearest to each other.
+    """Find pairs of descriptors that are nearest to each other. Returns (index pairs (k, 2) uint32, ratios (k,)).
 
-    Returns (index pairs (k, 2) uint32, ratios (k,)). Each pair has a ratio in both directions, see `nearest`. The
-    larger one is returned, and it is less than `LOOSE`.
+    `first` (n, 128), `second` (m, 128), uint8. A ratio is the angle between the two, divided by the angle to the second
+    nearest descriptor; of both directions, the larger one. Pairs with a ratio of `LOOSE` or more are left out.
     """
     there, ratio = nearest(first, second)
     rows = (ratio < LOOSE).nonzero()[:, 0]
@@ -153,10 +158,11 @@ def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.nda
 
 
 def match_pair(first: Features, second: Features) -> Any:
-    """Estimate the two-view geometry of two images with COLMAP. Its inliers are all matches that agree with it.
+    """Match the features of two images, and estimate their two-view geometry by COLMAP, which is returned.
 
-    The geometry is found from the matches that pass the ratio test. Then other matches are added if they agree with the
-    geometry. Few of these are wrong, even if their ratio is near 1, for example for two similar features on an object.
+    Its inliers are the matches. The geometry is found from matches with a low ratio of the angles to the nearest and
+    the second nearest descriptor. Then all other matches are added that agree with the geometry. Few of these are
+    wrong, even with a ratio near 1, for example for two similar features of an object.
     """
     matches, ratios = match_descriptors(first.descriptors, second.descriptors)
     geometry = pycolmap.estimate_two_view_geometry(
@@ -169,17 +175,17 @@ def match_pair(first: Features, second: Features) -> Any:
 
 
 def verification() -> Any:
-    """Return options of COLMAP's geometric verification. With these, its result does not depend on the thread."""
+    """Return options for COLMAP's geometric verification, with a fixed random seed, so that results can be repeated."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     return options
 
 
 def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the residuals (k,) [px] of k matches in a two-view geometry. `first`, `second`: their points (k, 2) [px].
+    """Return how far k matches are from agreement with a two-view geometry of COLMAP, (k,) [px].
 
-    If the geometry is a homography, a residual is the distance of the second point from the mapped first one. Otherwise
-    it is the Sampson distance from the epipolar line.
+    `first`, `second` (k, 2): the points of the matches in both images [px]. For a homography, it is the distance of the
+    second point from the mapped first one. Otherwise it is the Sampson distance from the epipolar line.
     """
     kinds = pycolmap.TwoViewGeometryConfiguration
     if geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
@@ -189,11 +195,11 @@ def distances(geometry: Any, first: np.ndarray, second: np.ndarray) -> np.ndarra
 
 
 def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]:
-    """Choose which pairs of photographs are matched. Returns pairs of indices.
+    """Choose which pairs of photographs to match. Returns pairs of indices (a, b), with a < b.
 
-    `descriptors`: (n, 128) for each photograph, sorted by the photograph's name. If there are many photographs, only
-    similar ones and neighbours are paired. Similar photographs show the same visual words (Sivic and Zisserman, "Video
-    Google", 2003). The words are descriptors drawn from all photographs.
+    `descriptors`: (n, 128) uint8 for each photograph, sorted by the photograph's name. If there are more than
+    `ALL_PAIRS` photographs, only similar ones and neighbours are paired. Similar photographs show the same visual words
+    (Sivic and Zisserman, "Video Google", 2003). The words are descriptors drawn from all photographs.
     """
     pairs = list(itertools.combinations(range(len(descriptors)), 2))
     if len(descriptors) <= ALL_PAIRS:
@@ -210,17 +216,17 @@ def pairs_to_match(descriptors: Sequence[torch.Tensor]) -> list[tuple[int, int]]
 
 
 def count_words(descriptors: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
-    """Return how many of the descriptors (n, 128) are nearest to each of m `words` (m, 128): a histogram (m + 1,).
+    """Count how many descriptors are nearest to each of m visual words. Returns a histogram (m + 1,).
 
-    The last bin counts descriptors that match no word.
+    `descriptors` (n, 128), `words` (m, 128), uint8. The last bin counts descriptors that are near no word.
     """
     return torch.bincount(nearest(descriptors, words)[0], minlength=len(words) + 1)
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Match the pairs of photographs that the database lacks, and write the matches there.
+    """Match the pairs of photographs that the COLMAP database `folder`/database.db lacks, and write the matches there.
 
-    Raises InputError if most pairs of the first batch are from one viewpoint.
+    Features must be there already. Raises InputError if most of the first pairs are from one viewpoint.
     """
     features = read_features(folder / "database.db")
     files = [grey_file(picture) for picture in pictures]
@@ -236,9 +242,10 @@ def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress
 def match_pairs(
     pairs: Sequence[tuple[str, str]], features: Mapping[str, Features], folder: Path
 ) -> Iterator[tuple[str, str]]:
-    """Match pairs of files. Yields each pair when its two-view geometry is in the database.
+    """Match pairs of images. Yields each pair when its matches are in the COLMAP database `folder`/database.db.
 
-    A pair that has a geometry there already is not matched again.
+    `pairs`: file names of grey images. `features`: by file name. A pair that is in the database already is not matched
+    again.
     """
     with pycolmap.Database.open(folder / "database.db") as opened:
         for batch in batches(pairs, BATCH):
@@ -250,10 +257,11 @@ def match_pairs(
 
 
 def match_again(files: Collection[str], folder: Path, progress: Progress) -> bool:
-    """Match some pairs again by guided matching: pairs that have matches and contain one of these files.
+    """Match pairs of images again by guided matching. Returns True if there was such a pair.
 
-    Guided matching searches only along the epipolar lines. It finds more matches, but also more wrong ones. Returns
-    whether there was such a pair.
+    The pairs are those that have matches and contain one of `files`, names of grey images. Guided matching searches
+    along the epipolar lines. It finds more matches, but also more wrong ones. The COLMAP database `folder`/database.db
+    is changed.
     """
     database = folder / "database.db"
     pairs = [(a.name, b.name) for a, b, first, _ in read_matches(database)
@@ -269,9 +277,9 @@ def match_again(files: Collection[str], folder: Path, progress: Progress) -> boo
 
 
 def match_by_library(pairs: Sequence[tuple[str, str]], folder: Path, guided: bool = True) -> None:
-    """Match pairs of files by COLMAP's own matcher, and write the result to its database.
+    """Match pairs of images by COLMAP's own matcher, and write the result to the database `folder`/database.db.
 
-    `guided`: search once more along the epipolar lines.
+    `pairs`: file names of grey images. `guided`: search once more along the epipolar lines.
     """
     listed = folder / "pairs.txt"
     write_file(listed, "".join(f"{a} {b}\n" for a, b in pairs))
@@ -281,9 +289,10 @@ def match_by_library(pairs: Sequence[tuple[str, str]], folder: Path, guided: boo
 
 
 def static_share(database: Path, pairs: Sequence[tuple[str, str]]) -> float:
-    """Return the share of the `pairs` of grey files that match and are from one viewpoint.
+    """Return which share of pairs of images match and are from one viewpoint, 0 to 1.
 
-    If two photographs are from one viewpoint, all features move alike between them.
+    `database`: file of COLMAP. `pairs`: file names of grey images. Two images are from one viewpoint if all features
+    move alike between them.
     """
     with pycolmap.Database.open(database) as opened:
         width = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}

@@ -1,4 +1,4 @@
-"""Finds the object in the photographs: where it is, and its masks."""
+"""Finds the object in the photographs: its position and its masks."""
 
 import contextlib
 import hashlib
@@ -36,7 +36,7 @@ WIDE = 2.0  #: half size of the table's texture from whole photographs [half siz
 
 
 class SegmentedObject(NamedTuple):
-    """The segmented object: its masks, its position, its mean radiance, and the table."""
+    """The object in the photographs: its masks, its position and brightness, and the table."""
 
     masks: dict[str, np.ndarray]  #: (H, W) uint8 of `OBJECT`, `UNKNOWN` and 0, by the photograph's name
     center: np.ndarray  #: (3,)
@@ -45,7 +45,7 @@ class SegmentedObject(NamedTuple):
 
 
 class SegmentationInput(NamedTuple):
-    """What the user or the sheet says about the object before it is segmented."""
+    """What is known about the object before it is searched, from the user or from the printed sheet."""
 
     plane: Plane | None = None  #: the table
     box: tuple[float, ...] | None = None  #: around the object: x low, x high, y low, y high, z low, z high
@@ -53,17 +53,20 @@ class SegmentationInput(NamedTuple):
     sheet: bool = False  #: is `plane` that of the printed sheet?
 
     def digest(self) -> str:
-        """Return a hash of the source of masks, to notice changes. For a folder: of file names, sizes and times."""
+        """Return a text that changes if the source of masks changes.
+
+        For a folder, it is a hash of file names, sizes and times; otherwise the name of the source.
+        """
         if not isinstance(self.masks, Path):
             return self.masks
         files = [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(self.masks.iterdir()) if f.is_file()]
         return hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
 
     def allows(self, points: np.ndarray, camera_distance: float, flatness: float = 2 * FLATNESS) -> np.ndarray:
-        """Return which points (N, 3) may belong to the object: (N,) bool.
+        """Test which points may belong to the object. Returns (N,) bool.
 
-        They must be in the box, if there is one. If there is a table, they must be at least `flatness` ·
-        `camera_distance` above it.
+        They must be in the box, if there is one. If there is a table, they must be higher above it than `flatness` ·
+        `camera_distance`. `points` (N, 3). `camera_distance`: median distance of the cameras from the object.
         """
         allowed = np.ones(len(points), bool)
         if self.plane:
@@ -77,10 +80,11 @@ class SegmentationInput(NamedTuple):
 def find_object(
     pictures: Sequence[Picture], sparse: SparseModel, known: SegmentationInput, folder: Path, progress: Progress
 ) -> SegmentedObject:
-    """Segment the object in all photographs that have a camera. The masks are written to `folder`.
+    """Find the object in the photographs that have a camera, and write its masks into `folder`.
 
-    If `folder` has masks already, these are used, because the user may have edited them. Raises InputError if they were
-    made with other cameras or another `known`. Also raises InputError if no object is found.
+    `sparse`: cameras and points. `known`: what is known about the object. If `folder` has masks already, these are
+    used, because the user may have edited them. Raises InputError if they were made with other cameras or another
+    `known`, and if no object is found.
     """
     folder.mkdir(exist_ok=True)
     record = folder / "object.json"
@@ -117,10 +121,11 @@ def find_object(
 
 
 def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarray]:
-    """Read the masks in a folder. Returns a dict from names of photographs to masks, as in `SegmentedObject.masks`.
+    """Read the masks in a folder, NAME.png for a photograph NAME. Returns masks by the photograph's name.
 
-    The file of a mask has the name of its photograph. A photograph without such a file is left out. Raises InputError
-    if there is no file at all, or if the size of a mask is not that of its photograph divided by a whole number.
+    A mask is (H, W) uint8 with the values `OBJECT`, `UNKNOWN` and 0. Photographs without a mask are left out. Raises
+    InputError if there is no mask at all, or if the size of a mask is not that of its photograph divided by a whole
+    number.
     """
     found = {}
     for picture in pictures:
@@ -143,7 +148,8 @@ def given_masks(
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
     """Read the user's masks, and find the object by them. Returns (object, masks by the photograph's name).
 
-    Raises InputError if there are too few masks, or if they disagree.
+    `pictures`: photographs with a camera in `sparse`. `grid`: voxels to search. `known`: source of the masks, and the
+    box. Raises InputError if there are too few masks, or if they disagree.
     """
     masks = {}
     for picture in progress(pictures, "masks"):
@@ -166,7 +172,10 @@ def given_masks(
 
 
 def require_half(count: int, pictures: Sequence[Picture], source: str | Path) -> None:
-    """Raise InputError if fewer than half of the photographs have a mask. `source`: as for `Picture.mask`."""
+    """Raise InputError if fewer than half of the photographs have a mask.
+
+    `count`: number of masks. `source`: "alpha", "rembg" or the folder of the masks, for the message.
+    """
     if count < len(pictures) / 2:
         name = pictures[0].path.name
         what = "--masks alpha: there are" if source == "alpha" else f"--masks: {source}: has"
@@ -175,9 +184,9 @@ def require_half(count: int, pictures: Sequence[Picture], source: str | Path) ->
 
 
 def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
-    """Return a mask (H, W) uint8 in a camera's view: 1 on the box that contains the object.
+    """Return a mask (H, W) uint8 for a camera: 1 where the picture shows the box, otherwise 0.
 
-    If the box reaches behind the camera, the mask is 1 everywhere.
+    `box`: x low, x high, y low, y high, z low, z high. If the box reaches behind the camera, the mask is 1 everywhere.
     """
     pixels, depth = camera.project(np.array(list(itertools.product(*np.reshape(box, (3, 2))))))
     if depth.min() <= 0:  # a corner is behind the camera
@@ -189,9 +198,11 @@ def box_mask(camera: Camera, box: Sequence[float]) -> np.ndarray:
 def find_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """Segment the object. Returns (object, masks by the photograph's name). Unclear masks are left out.
+    """Find the object without masks of the user. Returns (object, masks by the photograph's name).
 
-    Raises InputError if no object is found, or if too few masks agree.
+    `pictures`: photographs with a camera in `sparse`. `grid`: voxels to search, with views of the whole photographs.
+    `known`: table and box. Photographs with unclear masks are left out. Raises InputError if no object is found, or if
+    too few masks agree.
     """
     folder = pictures[0].path.parent
     found = locate_object(grid, sparse.points, known, progress)
@@ -226,9 +237,10 @@ def refine_object(
     views: Views, found: VoxelObject, whole: VoxelGrid, known: SegmentationInput, settings: RefinementSettings,
     progress: Progress,
 ) -> Segmentation | None:  # fmt: skip
-    """Refine the masks of the object `found` in `views`, which show it enlarged. Returns None if the masks disagree.
+    """Refine the object `found` and its masks in views that show it enlarged. Returns None if the masks disagree.
 
-    `whole`: grid with the views of whole photographs.
+    `views`: enlarged views. `whole`: grid with the views of whole photographs, from which the table's appearance is
+    estimated. `known`: table and box. `settings`: of the votes and of GrabCut.
     """
     grid = VoxelGrid.around(views, found)
     grid.allowed = known.allows(grid.points, grid.camera_distance, FLATNESS / 2)
@@ -248,11 +260,12 @@ def refine_object(
 def locate_object(
     grid: VoxelGrid, points: np.ndarray, known: SegmentationInput, progress: Progress
 ) -> VoxelObject | None:
-    """Find the object by its difference from the table, else by its brightness, else by a short fit.
+    """Find the object coarsely in the views of `grid`. Returns None if that fails.
 
-    Returns None if all three fail. `points` (N, 3): sparse points, from which the fit starts. Brightness is not used
-    with the sheet, because its paper is bright. It is also not used at pixels that show the table's pattern, because
-    the flash lights the table, too.
+    Three methods are tried in turn: the difference from the table, the brightness under the flash, and a short fit.
+    Brightness is not used with the printed sheet, because its paper is bright, nor at pixels that show the table's
+    pattern. `points` (N, 3): sparse points, from which the fit starts. `known`: table, box and sheet. `grid.allowed` is
+    set.
     """
     grid.allowed = known.allows(grid.points, grid.camera_distance)
     table = known.plane and TableAppearance(grid.views, TexelGrid(known.plane, grid.center, grid.half_size), progress)

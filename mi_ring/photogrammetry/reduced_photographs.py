@@ -1,4 +1,4 @@
-"""Photographs that are reduced and undistorted, with their cameras. The object is searched in these."""
+"""Reduced and undistorted photographs with their cameras, in which the object is searched."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,7 +18,7 @@ MARGIN = 0.3  #: around the object in a window [size of the object]
 
 
 class ReducedView(NamedTuple):
-    """A photograph, or a window of a photograph, after reduction and undistortion."""
+    """A photograph, or a window of a photograph, reduced and undistorted, with its camera."""
 
     name: str
     rgb: np.ndarray  #: (H, W, 3) uint8 sRGB
@@ -31,9 +31,9 @@ class ReducedView(NamedTuple):
         return srgb_to_linear(np.arange(256, dtype=np.float32) / 255)[self.rgb]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points (N, 3) to the view.
+        """Project points (N, 3). Returns (rows (N,), columns (N,), (N,) bool: True if the view shows the point).
 
-        Returns (rows (N,), columns (N,), whether the view shows the point (N,)). Rows and columns are whole pixels.
+        Rows and columns are whole pixels; 0 for points outside. Whether something hides a point is not tested.
         """
         projection, (width, height) = self.camera.projection.astype(np.float32), self.camera.size
         x, y, depth = projection[:, :3] @ points.astype(np.float32).T + projection[:, 3:]
@@ -49,7 +49,11 @@ Masks = Sequence[np.ndarray]  #: (H, W) uint8 each, above 0 inside
 
 
 def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """Reduce an image (H, W, …) uint8 by area means, and undistort it. Returns the pixels (h, w, …) of a window."""
+    """Reduce and undistort an image, and crop it to a window. Returns pixels (h, w, …) uint8.
+
+    `image` (H, W, …) uint8: the whole photograph. `lens`: lens of the photograph. `window`: position, size and scale of
+    the result. `interpolation`: OpenCV's flag for the undistortion.
+    """
     height, width = (side // window.scale for side in image.shape[:2])
     whole = image[: height * window.scale, : width * window.scale]
     small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
@@ -58,9 +62,10 @@ def undistort_view(image: np.ndarray, lens: Lens, window: Window, interpolation:
 
 
 def reduce_photograph(picture: Picture, lens: Lens, pose: np.ndarray, window: Window) -> ReducedView:
-    """Reduce a photograph to the scale of `window`, remove the distortion of its `lens`, and crop it to the window.
+    """Reduce and undistort a photograph, and crop it to a window. Returns the view.
 
-    `pose` (4, 4): camera-to-world, OpenCV's axes. Returns the pixels, which of them are valid, and their camera.
+    `lens`: lens of the whole photograph. `pose` (4, 4): camera-to-world, OpenCV's axes. `window`: position, size and
+    scale of the view.
     """
     rgb, camera = picture.srgb(), lens.camera(pose).shrunk(window.scale)
     corner = np.array([window.left, window.top]) / window.scale
@@ -73,9 +78,10 @@ def read_windows(
     pictures: Sequence[Picture], windows: Sequence[Sequence[Window]], cameras: Mapping[str, tuple[Lens, np.ndarray]],
     progress: Progress,
 ) -> list[list[ReducedView]]:  # fmt: skip
-    """Read each photograph, and make the views of its windows. Returns a list of views for each photograph.
+    """Read each photograph once, and make the views of its windows. Returns a list of views for each photograph.
 
-    `windows`: a list for each photograph. `cameras`: lens and pose (4, 4) by the photograph's name.
+    `windows`: a list of windows for each photograph. `cameras`: (lens, camera-to-world pose (4, 4)) by the photograph's
+    name.
     """
 
     def read(picture: Picture, wanted: Sequence[Window]) -> list[ReducedView]:
@@ -87,7 +93,7 @@ def read_windows(
 
 
 def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
-    """Undistort a photograph's mask (H, W) uint8, and reduce it. Returns (h, w) uint8, 0 or 1.
+    """Undistort and reduce a photograph's mask (H, W) uint8 of 0 to 255. Returns (h, w) uint8, 0 or 1.
 
     `longest`: largest length of the longer side [px].
     """
@@ -95,9 +101,10 @@ def reduce_mask(mask: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
 
 
 def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
-    """Choose a window around the object in a photograph. `mask` (h, w): the object in the whole photograph.
+    """Choose a window around the object in a photograph, with a margin, and the scale of its reduction.
 
-    `pixels`: approximate length of the object in the reduced window [px].
+    `lens`: lens of the photograph. `mask` (h, w): above 0 on the object. It covers the whole undistorted photograph,
+    and may be reduced. `pixels`: approximate length of the object in the reduced window [px].
     """
     rows, columns = np.nonzero(mask)
     size = np.array(lens.size)
@@ -112,9 +119,9 @@ def window_around(lens: Lens, mask: np.ndarray, pixels: int) -> Window:
 
 
 def paste_mask(mask: np.ndarray, lens: Lens, window: Window) -> np.ndarray:
-    """Paste a window's mask (h, w) into a mask of the whole photograph, which is 0 outside the window.
+    """Paste the mask of a window into a mask of the whole photograph, which is returned, at the window's scale.
 
-    The result has the scale of the window.
+    `mask` (h, w): mask of the window. Outside of the window, the result is 0.
     """
     full = np.zeros((lens.size[1] // window.scale, lens.size[0] // window.scale), mask.dtype)
     left, top = window.left // window.scale, window.top // window.scale

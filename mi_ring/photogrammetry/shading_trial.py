@@ -1,4 +1,4 @@
-"""Finds the object by its shading alone. It runs a short fit without masks that starts from a sphere."""
+"""Finds the object by its shading alone: a short fit without masks that starts from a sphere."""
 
 import numpy as np
 
@@ -20,9 +20,9 @@ SETTINGS = Config.preset("fast", iterations=ITERATIONS, levels=(4,), widths=(128
 
 
 def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> tuple[np.ndarray, float] | None:
-    """Find a sphere around most of those `points` (N, 3) that are near `center`.
+    """Find a sphere around most of the points near `center`. Returns (centre (3,), radius).
 
-    They are near if they are closer than `half_size`. Returns (centre (3,), radius), or None if too few points are
+    `points` (N, 3): sparse points. Those closer to `center` (3,) than `half_size` are near. Returns None if too few are
     near.
     """
     near = points[np.linalg.norm(points - center, axis=1) < half_size]
@@ -34,9 +34,9 @@ def initial_sphere(points: np.ndarray, center: np.ndarray, half_size: float) -> 
 
 
 def shading_silhouettes(views: Views, center: np.ndarray, radius: float, progress: Progress) -> list[np.ndarray]:
-    """Run a short fit that starts from a sphere. Returns the object's mask (H, W) uint8 in each view, 1 on the object.
+    """Find the object by a short fit that starts from a sphere. Returns its mask (H, W) uint8 in each view, 1 inside.
 
-    Raises InputError if the fit diverges.
+    `center` (3,), `radius`: the sphere. Raises InputError if the fit diverges.
     """
     distance = float(np.median([np.linalg.norm(view.camera.position - center) for view in views]))
     level = float(np.median([view.linear[view.valid].mean() for view in views]))

@@ -43,7 +43,7 @@ BLURRED = 0.25  #: a photograph with less detail is blurred [detail of those wit
 
 @dataclass
 class SparseModel:
-    """Cameras by the photograph's name, and a sparse point cloud of the scene [any unit]."""
+    """The cameras of photographs, and a sparse point cloud of the scene, in any unit of length."""
 
     cameras: dict[str, tuple[Lens, np.ndarray]]  #: lens and camera-to-world pose (4, 4), OpenCV's axes
     points: np.ndarray  #: (N, 3)
@@ -52,7 +52,7 @@ class SparseModel:
     source: str = ""  #: where the cameras are from; empty: structure from motion
 
     def digest(self) -> str:
-        """Return a hash of the cameras, to notice changes."""
+        """Return a hash of the cameras as text, which changes if a camera changes."""
         cameras = [f"{name} {lens.model} {lens.params} {pose.round(6).tolist()}"
                    for name, (lens, pose) in sorted(self.cameras.items())]  # fmt: skip
         return hashlib.blake2b("\n".join(cameras).encode(), digest_size=8).hexdigest()
@@ -62,7 +62,10 @@ class SparseModel:
         return float(np.median([np.linalg.norm(pose[:3, 3] - point) for _, pose in self.cameras.values()]))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "SparseModel":
-        """Return a model with transformed cameras and points: x ↦ scale · rotation (3, 3) x + shift (3,)."""
+        """Return a copy with cameras and points in another frame: a point x becomes scale · rotation · x + shift.
+
+        `rotation` (3, 3), `shift` (3,).
+        """
         cameras = {n: (lens, moved_pose(pose, scale, rotation, shift)) for n, (lens, pose) in self.cameras.items()}
         return replace(self, cameras=cameras, points=scale * self.points @ rotation.T + shift)
 
@@ -70,9 +73,10 @@ class SparseModel:
 def structure_from_motion(
     pictures: Sequence[Picture], detections: Detections, folder: Path, progress: Progress
 ) -> SparseModel:
-    """Estimate the cameras from image features. All photographs of one size share a lens.
+    """Find the cameras of photographs by COLMAP from image features. All photographs of one size share a lens.
 
-    The result is saved in `folder`. If it is there already, it is read. Raises InputError if fewer than half of the
+    `detections`: corners of the printed sheet by the photograph's name, which improve the result; empty: none. The
+    result is saved in `folder`. If it is there already, it is only read. Raises InputError if fewer than half of the
     photographs get a camera.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
@@ -103,17 +107,19 @@ def structure_from_motion(
 
 
 def placed_files(model: Any) -> set[str]:
-    """Return the file names of the images that have a pose in a model. If `model` is None, the set is empty."""
+    """Return the file names of the images that have a pose in a COLMAP model; empty if `model` is None."""
     return {model.images[k].name for k in model.reg_image_ids()} if model else set()
 
 
 def reconstruct(folder: Path, count: int, progress: Progress) -> Any:
-    """Reconstruct the cameras of `count` photographs in two ways. Returns the better model, or None if both fail.
+    """Reconstruct the cameras in two ways. Returns the better COLMAP model, or None if both fail.
 
     The better model is the one whose cameras explain more matches. Global mapping ("Global Structure-from-Motion
     Revisited", Pan et al. 2024) uses all matches from the start. Incremental mapping tolerates more wrong matches
     (repeated patterns, moving shadows), but it may mirror a camera that sees few points in one plane. In both models,
-    images that `disconnected_images` returns lose their poses.
+    images lose their poses if no reliable matches connect them to the others.
+
+    `folder`: has the database of matches, and the grey images. `count`: number of photographs, for the progress bar.
     """
     paths = database, _, output = folder / "database.db", folder / "grey", folder / "models"
     output.mkdir(exist_ok=True)
@@ -133,13 +139,16 @@ def reconstruct(folder: Path, count: int, progress: Progress) -> Any:
 
 
 def deregister(model: Any, images: Iterable[int]) -> None:
-    """Remove the poses of these images from a model. `model` is changed."""
+    """Remove the poses of images from a COLMAP model, which is changed. `images`: their ids."""
     for k in list(images):
         model.deregister_frame(model.images[k].frame_id)
 
 
 def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
-    """Run COLMAP's global mapping. Returns a dict from numbers to models. `paths`: database, images, output."""
+    """Run COLMAP's global mapping. Returns the models by number; there may be none.
+
+    `paths`: the database, the folder of images, and a folder for output.
+    """
     options = pycolmap.GlobalPipelineOptions(random_seed=0)
     mapper = options.mapper
     for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
@@ -149,9 +158,10 @@ def map_globally(paths: Sequence[Path], progress: Progress) -> dict[int, Any]:
 
 
 def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> dict[int, Any]:
-    """Run COLMAP's incremental mapping. Returns a dict from numbers to models. `paths`: database, images, output.
+    """Run COLMAP's incremental mapping. Returns the models by number; there may be none.
 
-    `count`: number of photographs, for the progress bar.
+    `paths`: the database, the folder of images, and a folder for output. `count`: number of photographs, for the
+    progress bar.
     """
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, extract_colors=False)
     options.mapper.random_seed = options.triangulation.random_seed = 0
@@ -165,7 +175,7 @@ def map_incrementally(paths: Sequence[Path], count: int, progress: Progress) -> 
 
 
 class ImagePair(NamedTuple):
-    """Two images of a model, their number of matches, and how many of these agree with the poses."""
+    """Two images of a COLMAP model (their ids), their number of matches, and how many of these agree with the poses."""
 
     first: int
     second: int
@@ -174,7 +184,10 @@ class ImagePair(NamedTuple):
 
 
 def check_pairs(model: Any, database: Path) -> list[ImagePair]:
-    """Count, for each pair of images with poses, all matches and those that agree with the poses."""
+    """Count the matches of each pair of images that have poses, and those of them that agree with the poses.
+
+    `database`: COLMAP's file with the matches. Pairs without matches are left out.
+    """
     images = {model.images[k].name: model.images[k] for k in model.reg_image_ids()}
     pairs = []
     for one, other, first, second in read_matches(database):
@@ -186,11 +199,11 @@ def check_pairs(model: Any, database: Path) -> list[ImagePair]:
 
 
 def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> list[int]:
-    """Return the images whose poses must be removed: those outside the largest connected part.
+    """Return the ids of images whose poses are unreliable, because no good pair connects them to the largest group.
 
-    Two images are connected if their poses explain most of their matches. The poses of other parts are random relative
-    to the largest part. Images of a part with only one or two images are not returned. The vote on masks tolerates so
-    few wrong poses.
+    A pair connects two images if their poses explain most of their matches. Images form groups by these pairs. The
+    poses of other groups are random relative to the largest group. Groups of only one or two images are not returned: a
+    few wrong poses do no harm to the masks. `images`: ids of all images with poses.
     """
     index = {k: number for number, k in enumerate(images)}
     firm = [p for p in pairs if p.matches >= PAIR_MATCHES and p.explained > PAIR_EXPLAINED * p.matches]
@@ -202,9 +215,9 @@ def disconnected_images(images: Sequence[int], pairs: Sequence[ImagePair]) -> li
 
 
 def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the Sampson distances (n,) [px] of n matches between the images `a` and `b`, by their poses in a model.
+    """Return the Sampson distances (n,) [px] of n matches from the epipolar lines that two images' poses give.
 
-    `first`, `second` (n, 2) [px]: the points of the matches in `a` and in `b`.
+    `a`, `b`: images of `model` with poses. `first`, `second` (n, 2): the points of the matches in `a` and in `b` [px].
     """
     cameras = model.cameras[a.camera_id], model.cameras[b.camera_id]
     rays = (camera.cam_from_img(pixels) for camera, pixels in zip(cameras, (first, second)))
@@ -213,19 +226,25 @@ def sampson_distance(model: Any, a: Any, b: Any, first: np.ndarray, second: np.n
 
 
 def to_sparse_model(model: Any, pictures: Sequence[Picture], folder: Path) -> SparseModel:
-    """Convert a COLMAP model. The result's cameras and reprojection error [px] are for photographs at full size."""
+    """Convert a COLMAP model. Its images are reduced; the result's cameras and error are for photographs at full size.
+
+    `folder`: has the database and the grey images, from which the reasons of failures are found.
+    """
     cameras, scales = model_cameras(model, pictures), [scale for _, _, scale in registered(model, pictures)]
     error = float(model.compute_mean_reprojection_error() * np.mean(scales))
     return SparseModel(cameras, model_points(model), error, failure_reasons(pictures, cameras, folder))
 
 
 def model_points(model: Any) -> np.ndarray:
-    """Return the points (N, 3) of a model."""
+    """Return the points (N, 3) of a COLMAP model."""
     return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
 
 
 def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: Path) -> dict[str, str]:
-    """Say why photographs that are not `placed` have no camera. Returns a dict from their names to the reasons."""
+    """Find out why photographs have no camera. Returns texts for the user by the photograph's name.
+
+    `placed`: names of the photographs that have a camera. `folder`: has the database and the grey images.
+    """
     failed, reasons = [picture for picture in pictures if picture.name not in placed], {}
     detail = {p.name: sharpness(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
     for name, file in ((picture.name, grey_file(picture)) for picture in failed):
@@ -241,13 +260,16 @@ def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: 
 
 
 def sharpness(file: Path) -> float:
-    """Return the sharpness of an image. It is the variance of the Laplacian, after a blur against noise."""
+    """Return how sharp an image file is: the variance of its Laplacian, after a blur against noise."""
     grey = read_image(file)[:, :, 0]
     return float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F).var())
 
 
 def advice(pictures: Sequence[Picture], folder: Path, count: int) -> str:
-    """Return a clause for the user: why only `count` photographs have a camera, and what to do."""
+    """Return a clause for the user that says why so few photographs have a camera, and what to do.
+
+    `count`: number of photographs that have one. `folder`: has the database of features and matches.
+    """
     with pycolmap.Database.open(folder / "database.db") as opened:
         features = np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()])
         matched = sum(len(geometry.inlier_matches) >= MIN_MATCHES for geometry in opened.read_two_view_geometries()[1])

@@ -1,4 +1,4 @@
-"""The table under the object: its plane, its appearance, its albedo, and masks of pixels that show it or do not."""
+"""The table under the object: its plane, appearance and albedo, and masks of pixels that show it."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -37,13 +37,13 @@ NEAR, INSIDE, CONFUSED, SPECK = 0.3, 0.1, 0.03, 0.015
 
 
 class Plane(NamedTuple):
-    """The table's plane, normal · x = offset. The unit normal points to the side of the cameras."""
+    """A plane normal · x = offset, such as the table. Its unit normal points to the side of the cameras."""
 
     normal: np.ndarray  #: (3,)
     offset: float
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Return the heights (...) of points (..., 3) above the plane."""
+        """Return the signed heights (...) of points (..., 3) above the plane."""
         return points @ self.normal - self.offset
 
     def axes(self) -> np.ndarray:
@@ -52,9 +52,11 @@ class Plane(NamedTuple):
 
 
 def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half_size: float) -> Plane | None:
-    """Find the plane that contains most of the `points` (N, 3) around `center`, by RANSAC.
+    """Find the table: the plane with the most points around the object, by RANSAC.
 
-    Returns None if there is none. All `cameras`, positions (K, 3), must be above the plane.
+    `points` (N, 3): sparse points. `cameras` (K, 3): positions of the cameras, which must be above the plane. `center`
+    (3,): middle of the object. `half_size`: points up to twice this distance from `center` are used. Returns None if no
+    plane contains enough points.
     """
     near = points[np.linalg.norm(points - center, axis=1) < 2 * half_size]
     if len(near) < 50:
@@ -85,9 +87,9 @@ def find_plane(points: np.ndarray, cameras: np.ndarray, center: np.ndarray, half
 
 
 class TexelGrid:
-    """A square of texels × texels in a plane. Its middle is below `center` (3,).
+    """A square of texels in a plane, whose sides are 4 · `half_size` long.
 
-    The length of its sides is 4 · `half_size`.
+    The middle of the square is below `center` (3,). `texels`: number of texels along each side.
     """
 
     def __init__(self, plane: Plane, center: np.ndarray, half_size: float, texels: int = TEXELS) -> None:
@@ -101,7 +103,7 @@ class TexelGrid:
 
     @property
     def to_world(self) -> np.ndarray:
-        """Transform (4, 4) from Mitsuba's rectangle (x and y from -1 to 1, normal z) to the world.
+        """Transform (4, 4) from Mitsuba's rectangle (x and y from -1 to 1, normal z) to this square in the world.
 
         Row 0 of the texels is at y = -1.
         """
@@ -111,9 +113,9 @@ class TexelGrid:
         return np.column_stack([across, [*normal, 0], middle])
 
     def render(self, view: ReducedView, texels: np.ndarray) -> np.ndarray:
-        """Render values (texels², …) of the texels in a view. Returns (H, W, …).
+        """Draw the texture `texels` (texels², …) as a view shows it. Returns (H, W, …), with nearest texels.
 
-        Outside the square, the result is NaN for float32, and 0 for uint8.
+        Outside of the square, the result is NaN for float32 and 0 for uint8.
         """
         width, height = view.camera.size
         pixel_centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
@@ -131,11 +133,11 @@ class TexelGrid:
 def estimate_albedo(
     views: Views, lights: Sequence[Light], hidden: Masks, grid: TexelGrid, flash: FlashCalibration
 ) -> np.ndarray | None:
-    """Estimate the table's diffuse albedo (texels, texels, 3). Returns None if no view shows the table.
+    """Estimate the table's diffuse albedo. Returns (texels, texels, 3) in [0, 1], or None if no view shows the table.
 
-    The albedo is the median over the views. `lights`: one per view. `hidden`: for each view, an array (H, W) above 0
-    where something may hide the table. `flash`: gives the flash's cone, the room light and the camera's response.
-    Texels that no view shows get the median of the others. Interreflection is ignored.
+    It is the median over the views, without interreflection. Texels that no view shows get the median of the others.
+    `lights`: the flash for each view. `hidden`: for each view, an array (H, W) above 0 where something may hide the
+    table. `flash`: its cone, the room light and the camera's response are used.
     """
     found = np.full((len(views), grid.texels**2, 3), np.nan, np.float32)
     for own, view, light, mask in zip(found, views, lights, hidden, strict=True):
@@ -155,9 +157,10 @@ def estimate_albedo(
 
 
 class TableAppearance:
-    """The table's appearance: one texture for all views, times a smooth illumination for each view.
+    """The table's appearance: one texture for all views, times a smooth illumination of each view.
 
-    `hidden`: for each view, an array (H, W) above 0 where something may hide the table; None: nothing hides it.
+    Both are estimated from the views by the constructor. `hidden`: for each view, an array (H, W) above 0 where
+    something may hide the table; None: nothing hides it.
     """
 
     def __init__(self, views: Views, grid: TexelGrid, progress: Progress, hidden: Masks | None = None) -> None:
@@ -179,7 +182,7 @@ class TableAppearance:
         self.texture = np.concatenate([nan_median(self.observe_all(part)) for part in progress(parts, "table")])
 
     def observe(self, number: int, texels: np.ndarray) -> np.ndarray:
-        """Return the log radiance (N, 3) of some texels in view `number`, minus the view's log illumination.
+        """Return the log radiance (N, 3) of texels in view `number`, minus the log illumination of this view.
 
         `texels` (N,): indices of the texels. The result is NaN where the view does not show the texel.
         """
@@ -190,11 +193,17 @@ class TableAppearance:
         return np.where(inside[:, None], own, np.float32(np.nan))
 
     def observe_all(self, texels: np.ndarray) -> np.ndarray:
-        """Return the log radiance (views, N, 3) of the texels (N,) in all views. See `observe`."""
+        """Return the log radiance (views, N, 3) of texels in each view, minus the log illumination of the view.
+
+        `texels` (N,): indices of the texels. The result is NaN where a view does not show the texel.
+        """
         return np.stack(list(in_threads(partial(self.observe, texels=texels), range(len(self.views)))))
 
     def foreign_masks(self) -> list[np.ndarray]:
-        """Return a mask (H, W) uint8 for each view: pixels that differ from the table. Something stands there."""
+        """Return a mask (H, W) uint8 for each view: 1 where the picture differs from the table, otherwise 0.
+
+        Something stands there, such as the object.
+        """
         result, everywhere = [], np.arange(len(self.texture))
         for number, view in enumerate(self.progress(self.views, "beside the table")):
             rest = np.abs(self.observe(number, everywhere) - self.texture).max(1)
@@ -205,10 +214,7 @@ class TableAppearance:
         return result
 
     def pattern_masks(self) -> list[np.ndarray]:
-        """Return a mask (H, W) uint8 for each view: pixels that certainly show the table.
-
-        They match the pattern of the table's texture.
-        """
+        """Return a mask (H, W) uint8 for each view: 1 where the picture certainly shows the table, by its pattern."""
         known = self.texture.mean(1)
         return [
             match_pattern(LOG_RADIANCE[view.rgb].mean(-1), self.grid.render(view, known))
@@ -216,9 +222,9 @@ class TableAppearance:
         ]
 
     def expected(self, view: ReducedView) -> np.ndarray:
-        """Predict the log radiance (H, W, 3) of a view without the object. It is NaN where it is unknown.
+        """Predict the log radiance (H, W, 3) of a view as if there were no object; NaN where it is unknown.
 
-        `view` may be a window of one of the views.
+        `view`: one of the views, or another window of the same photograph.
         """
         number = [other.name for other in self.views].index(view.name)
         return self.grid.render(view, self.texture + (self.basis @ self.lighting[number])[:, None])
@@ -227,11 +233,11 @@ class TableAppearance:
 def bare_table(
     views: Views, silhouettes: Masks, tables: Sequence[TableAppearance], progress: Progress
 ) -> list[np.ndarray] | None:
-    """Return a mask (H, W) uint8 for each view: pixels that show only the table.
+    """Return a mask (H, W) uint8 for each view: above 0 where the picture shows only the table.
 
     `silhouettes`: for each view, a rough mask (H, W) of the object. `tables`: appearances of the table. Each pixel is
     compared with the first appearance that covers it. At first, darker pixels count as table in shadow. If too much of
-    the object then looks like the table, they no longer count. Returns None if the object still looks like the table.
+    the object then looks like the table, darker pixels no longer count. Returns None if that does not help.
     """
     differences = []
     for view in progress(views, "bare table"):
@@ -258,10 +264,10 @@ def bare_table(
 
 
 def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Return differences of log radiances (H, W, 3): in the mean, in red/green and in blue/green. NaN if unknown.
+    """Return differences between log radiances `seen` and `expected`, all (H, W, 3); NaN where `expected` is unknown.
 
-    A pixel of `seen` is compared with the nearest value in 3 × 3 pixels of `expected`, because the texture may be
-    shifted by a pixel.
+    The channels are the differences of the mean, of red/green and of blue/green. A pixel of `seen` is compared with the
+    nearest value in 3 × 3 pixels of `expected`, because the texture may be shifted by a pixel.
     """
 
     def split(log: np.ndarray) -> np.ndarray:
@@ -277,16 +283,17 @@ def colour_difference(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
 def nan_median(stack: np.ndarray) -> np.ndarray:
     """Return the median over the first axis, ignoring NaN. If all values are NaN, the median is NaN.
 
-    If two values are in the middle, the lower one is returned. The function is much faster than `np.nanmedian`.
+    Of two values in the middle, the lower one is returned. This is much faster than `np.nanmedian`.
     """
     middle = np.maximum(np.isfinite(stack).sum(0) - 1, 0) // 2
     return np.take_along_axis(np.sort(stack, 0), middle[None], 0)[0]
 
 
 def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return the coefficients (6,) of `basis` (N, 6) that fit the mean channel of `difference` (N, 3) best.
+    """Fit an illumination to log differences by robust least squares. Returns the coefficients (6,) of `basis`.
 
-    The fit is robust least squares.
+    `difference` (N, 3): differences of log radiance, whose mean over the channels is fitted; NaN: unknown. `basis` (N,
+    6): the basis functions at the N points.
     """
     mean = difference.mean(1)
     known = np.isfinite(mean)
@@ -300,9 +307,10 @@ def fit_lighting(difference: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def match_pattern(seen: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Return a mask (H, W) uint8 of pixels where the log radiance `seen` (H, W) correlates with that of the table.
+    """Return a mask (H, W) uint8: 1 where a picture certainly shows the table's pattern, by local correlation.
 
-    `table` (H, W): log radiance without the object; NaN where it is unknown.
+    `seen` (H, W): log radiance of the picture. `table` (H, W): expected log radiance of the table; NaN where it is
+    unknown.
     """
     known = np.isfinite(table)
     mean = partial(cv2.blur, ksize=(WINDOW, WINDOW))

@@ -38,9 +38,9 @@ FORMAT = 3  #: version of the saved results; increase it when they change
 
 
 def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
-    """Raise InputError if `folder` has results of other photographs or in another format.
+    """Raise InputError if `folder` has results of other photographs, or in another format.
 
-    Otherwise it creates the folder, and records the photographs there.
+    Otherwise create the folder, and record names, sizes and orientations of the photographs there.
     """
     with writing(f"{folder.parent}: DIR"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -59,10 +59,11 @@ def require_same_photographs(pictures: Sequence[Picture], folder: Path) -> None:
 def make_upright(
     sparse: SparseModel, center: np.ndarray, plane: Plane | None, ups: Mapping[str, np.ndarray]
 ) -> tuple[SparseModel, Plane | None, bool]:
-    """Transform model and table to a frame with origin `center` (3,), z up, and cameras at a distance of about 1.
+    """Transform cameras, points and table to a frame with origin `center` (3,), z up, and camera distances of about 1.
 
-    Returns (model, table, whether up is known). `ups`: up directions (3,) in camera axes, by the photograph's name. Up
-    is the table's normal. Without a table, up is the mean of `ups`. If they cancel out, up is unknown.
+    Returns (model, table, True if the up direction is known). Up is the normal of the table `plane`. If that is None,
+    up is the mean of `ups`: the up direction (3,) of each photograph in camera axes, by name. If these cancel out, up
+    is unknown, and the axes stay.
     """
     scale = 1 / sparse.distance(center)
     up = plane.normal if plane else np.mean([pose[:3, :3] @ ups[n] for n, (_, pose) in sparse.cameras.items()], 0)
@@ -73,7 +74,7 @@ def make_upright(
 
 
 class SheetObservations(NamedTuple):
-    """What the photographs show of the printed sheet. Both dicts have names of photographs as keys."""
+    """What the photographs show of the printed sheet: corners and white paper, by the photograph's name."""
 
     detections: dict[str, SheetDetection]
     papers: dict[str, PaperSamples]
@@ -82,10 +83,10 @@ class SheetObservations(NamedTuple):
 def find_sheet(
     pictures: Sequence[Picture], square: float, folder: Path, progress: Progress
 ) -> SheetObservations | None:
-    """Find the printed sheet in the photographs. `square`: side length of its squares [mm].
+    """Find the printed sheet in the photographs. Returns None if fewer than three photographs show it.
 
-    The result is saved in `folder`. If it is there already, it is read. Returns None if too few photographs show the
-    sheet. Raises InputError if a photograph cannot be read.
+    `square`: side length of the sheet's squares [mm]. The result is saved in `folder`. If it is there already, it is
+    only read. Raises InputError if a photograph cannot be read.
     """
     record = folder / "sheet.json"
     if (saved := read_json(record)) is None:
@@ -123,7 +124,7 @@ def find_sheet(
 def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
     """Read cameras that another tool has written beside the photographs. Returns None if there are none.
 
-    It prints the importer's notes. Raises InputError if the cameras are invalid, or if most photographs have no camera.
+    Prints the importer's notes. Raises InputError if the cameras are invalid, or if most photographs have no camera.
     """
     source = detect(pictures[0].path.parent)
     if source is None:
@@ -159,7 +160,10 @@ def imported_cameras(pictures: Sequence[Picture]) -> SparseModel | None:
 
 
 def require_parallax(sparse: SparseModel, folder: Path) -> None:
-    """Raise InputError if all photographs are from one side. Depth is then unknown."""
+    """Raise InputError if all photographs are from one side, so that depth is unknown.
+
+    `folder`: of the photographs, for the message.
+    """
     forward = np.stack([pose[:3, 2] for _, pose in sparse.cameras.values()])
     widest = float(np.degrees(np.arccos(np.clip((forward @ forward.T).min(), -1, 1))))
     if widest < MIN_DEGREES:
@@ -170,10 +174,11 @@ def require_parallax(sparse: SparseModel, folder: Path) -> None:
 def find_cameras(
     pictures: Sequence[Picture], sheet: SheetObservations | None, turntable: bool, folder: Path, progress: Progress
 ) -> SparseModel:
-    """Find the cameras: those of another tool, else by structure from motion, else by the printed sheet.
+    """Find the cameras: those of another tool, otherwise by structure from motion, otherwise by the printed sheet.
 
-    With `turntable`, only the sheet is used, because structure from motion would track the room. Raises InputError if
-    too few photographs get a camera.
+    `sheet`: what the photographs show of the sheet; None: nothing. `turntable`: the object turns with the sheet, so
+    only the sheet is used: structure from motion would track the room. `folder`: results of structure from motion are
+    saved there. Raises InputError if too few photographs get a camera.
     """
     if turntable:
         if sheet is None:
@@ -192,7 +197,7 @@ def find_cameras(
 
 
 def cameras_from_sheet(pictures: Sequence[Picture], sheet: SheetObservations) -> SparseModel:
-    """Find the cameras by the sheet alone, in its frame [mm].
+    """Find the cameras by the printed sheet alone, in the sheet's frame [mm].
 
     Raises InputError if fewer than half of the photographs get a camera.
     """
@@ -216,9 +221,10 @@ def flash_from_sheet(
     pictures: Sequence[Picture], sparse: SparseModel, found: SegmentedObject, offset: np.ndarray,
     sheet: SheetObservations,
 ) -> FlashCalibration | None:  # fmt: skip
-    """Calibrate the flash by the sheet. A sphere stands for the object. Returns None if no photograph shows the paper.
+    """Calibrate the flash by the sheet's white paper. Returns None if no photograph shows the paper.
 
-    `offset` (3,): approximate position of the flash relative to the lens, as for `calibrate_flash`.
+    The frame of `sparse` and `found` must be that of the sheet [mm]. A sphere stands for the object. `offset` (3,):
+    approximate position of the flash relative to the lens [mm], x right, y down, z forward in an upright photograph.
     """
     radii = []
     for name, mask in found.masks.items():
@@ -240,8 +246,8 @@ def posed_pictures(
 ) -> list[PosedPicture]:  # fmt: skip
     """Return the photographs that have a camera, each with its camera, light and mask.
 
-    `flash`: the calibration. If it is None, the flash is at `offset` (3,) relative to the lens [scene units], and its
-    intensity follows from `ASSUMED_ALBEDO`.
+    `flash`: calibrated flash. None: the flash is at `offset` (3,) relative to the lens [scene units], x right, y down,
+    z forward in an upright photograph, and its intensity follows from an assumed albedo of the object.
     """
     offsets = turn_with_cameras(pictures, flash.offset if flash else offset)
     known = flash.intensities if flash else {}

@@ -1,4 +1,4 @@
-"""The Mitsuba plugins, each in a file of its name.
+"""The Mitsuba plugins, one file per plugin with the plugin's name.
 
 May import: mitsuba, drjit, numpy, torch; rendering, objects, scene, geometry.
 """
@@ -11,7 +11,7 @@ PLUGINS = ("photograph", "flash", "room", "cooktorrance", "merl", "shapenet", "t
 
 
 def register() -> None:
-    """Define and register the plugins for the current variant of Mitsuba. Each variant needs its own classes."""
+    """Define and register the plugins for the current variant of Mitsuba. Call it after each change of the variant."""
     for name in PLUGINS:
         module = f"{__name__}.{name}"
         if module in sys.modules:

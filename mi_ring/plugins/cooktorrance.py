@@ -30,18 +30,18 @@ class CookTorrance(mi.BSDF):
     ``roughness``    float or texture  r, the width α of the distribution, at least 0.02. Default: the   P, ∂
                                        mesh attribute ``vertex_roughness``
     ``distribution`` string            D and its G: ``ggx`` or ``beckmann``. Default: ``ggx``
-    ``fresnel``      boolean           does the surface reflect more at grazing angles? Default: false,
-                                       as in the paper
+    ``fresnel``      boolean           true: it reflects more at grazing angles. Default: false, as in
+                                       the paper
     ================ ================= ================================================================= =====
 
     The paper does not name D and G. Here they are those of Walter et al. 2007 (Microfacet Models for Refraction through
     Rough Surfaces). D is equation 33 (GGX) or 25 (Beckmann) without its 1/π. G is Smith's product of equation 34 or 27;
-    for the latter it is Walter's rational fit, to within 0.35 %. So the specular part is 4 ρᵞ times ``roughconductor``
+    for Beckmann, it is Walter's rational fit, to within 0.35 %. So the specular part is 4 ρᵞ times ``roughconductor``
     with F = 1.
 
     With ``fresnel``, ρᵞ grows with the angle between o and h up to 1/4, the value of a mirror, by "An Inexpensive BRDF
     Model for Physically-based Rendering" (Schlick 1994): F = F₀ + (1 − F₀) (1 − o·h)⁵ with F₀ = 4 ρᵞ. This needs the
-    true ρᵞ. It makes no difference for a light next to the camera, but it does for light from a table.
+    true ρᵞ. It makes no difference for a light next to the camera, but it matters for light from a table.
 
     **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh::
 
@@ -97,34 +97,40 @@ class CookTorrance(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def parameters(self, si, active=True):
-        """Evaluate the three parameters (ρᵈ, ρᵞ, r) at the surface interactions `si`. r is clamped to at least 0.02."""
+        """Evaluate the parameters at the surface interactions `si`. Returns (ρᵈ, ρᵞ, r), with r at least 0.02."""
         diffuse = self.textures["diffuse"].eval(si, active)
         specular = self.textures["specular"].eval_1(si, active)
         return diffuse, specular, dr.maximum(self.textures["roughness"].eval_1(si, active), MIN_ROUGHNESS)
 
     @staticmethod
     def front(si, wo):
-        """Test whether viewer and `wo` are on the front side of the surface.
+        """Return a Dr.Jit mask: True where viewer and light are on the front side of the surface.
 
-        For the viewer, it is enough to be on the front side of the shading normal or of the geometric normal.
+        `wo`: direction to the light in the local frame of `si`. It must be on the front side of the shading normal. For
+        the viewer, the front side of either the shading normal or the geometric normal is enough.
         """
         n = si.to_local(si.n)
         return ((si.wi.z > 0) | (dr.dot(si.wi, n) > 0)) & (wo.z > 0)
 
     def microfacets(self, r):
-        """Make Mitsuba's microfacet distribution for roughness `r`. It evaluates D / π and G and samples normals."""
+        """Make Mitsuba's microfacet distribution for roughness `r`. Its `eval` is D / π, its `G` is G."""
         return mi.MicrofacetDistribution(DISTRIBUTIONS[self.distribution], r, True)
 
     def with_fresnel(self, specular, cosine):
-        """Return ρᵞ (`specular`) with the Fresnel term applied; without ``fresnel``, unchanged. `cosine`: o·h."""
+        """Return the specular reflectance at an angle between viewer and half vector. `cosine`: of this angle, o·h.
+
+        `specular`: ρᵞ, the reflectance at o = h. Without the parameter ``fresnel``, it is returned unchanged.
+        """
         if not self.fresnel:
             return specular
         return specular + dr.maximum(0.25 - specular, 0) * dr.power(1 - dr.clip(cosine, 0, 1), 5)
 
     def reflected(self, ctx, si, wo, diffuse, specular, r, active):
-        """Evaluate B (n·i) [1/sr], equation 1 times the cosine, for light from direction `wo`.
+        """Evaluate B (n·i) [1/sr], equation 1 times the cosine, for light from direction `wo` (local frame of `si`).
 
-        `diffuse`, `specular`, `r`: the `parameters` at `si`.
+        `diffuse`, `specular`, `r`: the parameters ρᵈ, ρᵞ and r at `si`. `ctx`: Mitsuba's BSDFContext; it can switch off
+        the diffuse or the specular part. The result is 0 where `active` is False, and for light or viewer behind the
+        surface.
         """
         o, i = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (si.wi, wo))
         h = dr.normalize(wo + si.wi)
@@ -137,12 +143,13 @@ class CookTorrance(mi.BSDF):
         return dr.select(active & self.front(si, wo), value * i.z, 0)
 
     def lobes(self, si, order, active=True):
-        """Compute how the BSDF reflects light that is given by spherical harmonics: as a list of two lobes.
+        """Compute how the surface reflects light that is given by spherical harmonics. Returns two lobes.
 
-        A lobe is symmetric about a direction. It is returned as (its direction in the world, `order` + 1 factors): the
-        factors of the degrees 0 to `order` of the harmonics about this direction. The diffuse lobe is that of "An
-        Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The specular lobe is
-        approximated by `gloss_table`.
+        The first lobe is diffuse, the second specular. A lobe is a pair (axis, factors). The axis is a unit vector in
+        the world, about which the lobe is symmetric. Factor l of the `order` + 1 factors multiplies the light's
+        harmonics of degree l, evaluated at the axis; the sum over l is the reflected radiance. The diffuse lobe is that
+        of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The specular
+        lobe is an approximation, tabulated over roughness and viewing angle.
         """
         diffuse, specular, r = self.parameters(si, active)
         active &= self.front(si, mi.Vector3f(0, 0, 1))
@@ -160,8 +167,8 @@ class CookTorrance(mi.BSDF):
     def gloss_probability(self, ctx, si, diffuse, specular):
         """Compute the probability with which `sample` chooses the specular lobe: 4 ρᵞ / (π ρᵈ + 4 ρᵞ).
 
-        π ρᵈ and 4 ρᵞ are upper bounds of the albedos of both lobes. The result has no gradients: the choice of a lobe
-        is not differentiated.
+        π ρᵈ and 4 ρᵞ are upper bounds of the albedos of both lobes. `diffuse`, `specular`: ρᵈ and ρᵞ. `ctx`: Mitsuba's
+        BSDFContext; if it switches one lobe off, the result is 0 or 1. The result has no gradients.
         """
         has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         has_gloss = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
@@ -174,9 +181,9 @@ class CookTorrance(mi.BSDF):
         return dr.select(d + s > 0, s / (d + s), 0.5)
 
     def density(self, si, wo, r, gloss, active):
-        """Compute the probability density [1/sr] with which `sample` draws the direction `wo`.
+        """Compute the probability density [1/sr] with which `sample` draws the direction `wo` (local frame of `si`).
 
-        `gloss`: probability of the specular lobe.
+        `r`: roughness. `gloss`: probability with which the specular lobe is chosen, 0 to 1.
         """
         facets = self.microfacets(r)
         h = dr.normalize(wo + si.wi)
@@ -224,9 +231,9 @@ class CookTorrance(mi.BSDF):
 
 
 def cosine_factors(order):
-    """Compute factors by which a diffuse surface with ρᵈ = 1 multiplies spherical harmonics of degrees 0 to `order`.
+    """Compute the factors by which a diffuse surface with ρᵈ = 1 multiplies spherical harmonics of incident light.
 
-    Returns a list of `order` + 1 numbers.
+    Returns a list of `order` + 1 numbers for the degrees 0 to `order`: the coefficients of the clamped cosine.
     """
     factors = [math.pi, 2 * math.pi / 3]
     for degree in range(2, order + 1):
@@ -239,13 +246,16 @@ def cosine_factors(order):
 
 @functools.lru_cache(maxsize=8)
 def gloss_table(variant, distribution, order):
-    """Tabulate the specular lobe for a specular reflectance of 1. Returns a texture over roughness and n·o.
+    """Tabulate the specular lobe for a specular reflectance of 1. Returns a Dr.Jit texture over (roughness, n·o).
 
-    The roughness goes from 0.02 to 1, n·o from 0 to 1. n is the normal, o the direction to the viewer. The channels 0
-    and 1 describe the mean direction of the lobe. Channel 0 is the component of this direction along the surface,
-    opposite to o, divided by the component of o along the surface. Channel 1 is its component along n. Channel 2 + l is
-    the integral of the lobe times the Legendre polynomial of degree l about the mean direction. The integrals are
-    averages over a grid of visible normals, as in `CookTorrance.sample`.
+    The roughness goes from 0.02 to 1, n·o from 0 to 1. n is the normal, o the direction to the viewer. Channels 0 and 1
+    describe the mean direction of the lobe. Channel 0 is its component along the surface, opposite to o, divided by the
+    component of o along the surface. Channel 1 is its component along n. Channel 2 + l is the integral of the lobe
+    times the Legendre polynomial of degree l about the mean direction, for l from 0 to `order`. The integrals are means
+    over a grid of visible normals.
+
+    `variant`: Mitsuba's current variant, which only serves as a key of the cache. `distribution`: ``ggx`` or
+    ``beckmann``.
     """
     with dr.suspend_grad():
         count = GLOSS_SAMPLES**2
@@ -277,7 +287,7 @@ def gloss_table(variant, distribution, order):
 
 
 def legendre(x, order):
-    """Evaluate the Legendre polynomials of degrees 0 to `order` at x, by Bonnet's recursion. Returns a list."""
+    """Evaluate the Legendre polynomials at `x`. Returns a list of `order` + 1 values, for the degrees 0 to `order`."""
     found = [mi.Float(1), x]
     for n in range(1, order):
         found.append(((2 * n + 1) * x * found[n] - n * found[n - 1]) / (n + 1))

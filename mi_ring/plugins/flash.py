@@ -1,4 +1,4 @@
-"""The `flash` emitter: it gives a photograph's own light to Mitsuba's integrators (Mitsuba plugin)."""
+"""The `flash` emitter: with it, Mitsuba's integrators find the light of a photograph (Mitsuba plugin)."""
 
 import drjit as dr
 import mitsuba as mi
@@ -8,10 +8,11 @@ from mi_ring.rendering.photograph_lights import DISTANT, flash_falloff
 
 
 def flash_light(it, sample=(0, 0), active=True):
-    """Sample the light of the photograph that is being rendered, at the interactions `it`.
+    """Sample the light that belongs to the photograph that is being rendered, at the interactions `it`.
 
-    Returns (DirectionSample3f, radiance · d⁻²), as `mi.Emitter.sample_direction`. The radiance is 0 while a sensor of
-    another kind is rendered.
+    `sample`: two random numbers, which a point light or a directional light does not need. Returns (Mitsuba's
+    DirectionSample3f, intensity / d² of a point light or irradiance of a directional light). The second is 0 if the
+    sensor that is being rendered is not a `photograph`.
     """
     if Photograph.current is None:
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
@@ -46,11 +47,11 @@ class InvisibleEmitter(mi.Emitter):
 
 
 class Flash(InvisibleEmitter):
-    """Gives the light of the `photograph` that is being rendered to the scene. Other sensors see it black.
+    """Lights the scene with the own light of the `photograph` that is being rendered; with other sensors, it is black.
 
     The emitter nested in a `photograph` lights only this photograph. It is not an emitter of the scene, so Mitsuba's
     own integrators do not find it. `flash` is an emitter of the scene. It passes every call on to the light of the
-    current photograph. It has no parameters. Each `shapenet` shape contains a `flash`.
+    photograph that is being rendered. It has no parameters. Each `shapenet` shape contains a `flash`.
 
     You need to write it only in a scene of `photograph` sensors without a `shapenet` shape:
 

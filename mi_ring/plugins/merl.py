@@ -79,7 +79,10 @@ class Merl(mi.BSDF):
         self.m_flags = self.m_components[0]
 
     def reflected(self, si, wo, active):
-        """Evaluate the BRDF times the cosine, f (n·i) [1/sr], for light from direction `wo`."""
+        """Evaluate the BRDF times the cosine, f (n·i) [1/sr], for light from direction `wo` (local frame of `si`).
+
+        The result is 0 where `active` is False, and for light or viewer behind the surface.
+        """
         h = dr.normalize(si.wi + wo)
         sin = dr.sqrt(h.x * h.x + h.y * h.y)
         across = sin > 1e-7
@@ -93,7 +96,7 @@ class Merl(mi.BSDF):
         return dr.select(active & (si.wi.z > 0) & (wo.z > 0), value, 0)
 
     def density(self, si, wo, active):
-        """Compute the probability density [1/sr] with which `sample` draws the direction `wo`."""
+        """Compute the probability density [1/sr] with which `sample` draws the direction `wo` (local frame of `si`)."""
         h = dr.normalize(si.wi + wo)
         sin = dr.maximum(dr.sqrt(h.x * h.x + h.y * h.y), MIN_ROOT**2)
         root = dr.sqrt(dr.minimum(dr.atan2(sin, h.z) / (dr.pi / 2), 1))

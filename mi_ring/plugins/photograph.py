@@ -53,8 +53,8 @@ class Photograph(mi.Sensor):
     ``falloff``      float        exponent of the flash's cone: a point light shines in a direction by   P, ∂
                                   its intensity times the cosine between this direction and where the
                                   camera looks, to this power. Default: 0, the same in all directions
-    ``calibrated``   boolean      are camera and light exact? Then a fit does not refine them by
-                                  default. Default: false
+    ``calibrated``   boolean      true: camera and light are exact, so a fit does not refine them unless
+                                  its options say so. Default: false
     (nested)         film         its size is the image's; exposed as ``film``                           P
     (nested)         emitter      ``point`` or ``directional``: the light of this photograph alone;      P, ∂
                                   exposed as ``light``. Default: a point light of intensity 1 at the
@@ -142,16 +142,16 @@ class Photograph(mi.Sensor):
 
     @property
     def camera(self) -> Camera:
-        """The camera as plain numbers, from the current parameters of the plugin."""
+        """The camera as NumPy values, read from the current parameters of the plugin."""
         matrix, distortion = np.array(self.to_world.matrix).reshape(4, 4), float(np.ravel(self.distortion)[0])
         size = tuple(map(int, self.film().size()))
         return Camera(matrix, np.array(self.focal).ravel(), np.array(self.centre).ravel(), size, distortion)
 
     @property
     def shot(self) -> Shot:
-        """The photograph as plain data, from the current parameters of the plugin. No image is read.
+        """Camera, light and file names of the photograph as NumPy values, from the current parameters of the plugin.
 
-        Raises SceneError if the nested light is neither a point light nor a directional light.
+        No image is read. Raises SceneError if the nested light is neither a point light nor a directional light.
         """
         if (kind := self.light.class_name()) not in LAMP_CLASSES:
             raise SceneError(f'photograph "{self.id()}": nested emitter is a {kind}, must be "point" or "directional"')

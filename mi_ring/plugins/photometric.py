@@ -24,7 +24,7 @@ class Photometric(ADIntegrator):
     =========== ======= =============================================================================== =====
     Parameter   Type    Description                                                                     Flags
     =========== ======= =============================================================================== =====
-    ``shadows`` boolean do the photographs' own lights cast shadows? Default: true
+    ``shadows`` boolean true: the photographs' own lights cast shadows. Default: true
     =========== ======= =============================================================================== =====
 
     The sampler of the sensor says the number of samples per pixel. The alpha channel is the share of the pixel that
@@ -65,7 +65,7 @@ class Photometric(ADIntegrator):
         return radiance, si.is_valid(), [], None
 
     def require_attributes(self, scene):
-        """Raise SceneError if a mesh lacks an attribute that its BSDF reads. Checks each scene once."""
+        """Raise SceneError if a mesh of the scene lacks an attribute that its BSDF reads. Checks each scene once."""
         shapes = scene.shapes()  # keeping the scene, which holds this integrator, would be a cycle
         if shapes != self.checked:
             for shape in shapes:
@@ -73,10 +73,11 @@ class Photometric(ADIntegrator):
             self.checked = shapes
 
     def differentiable(self, scene, sensor, seed, spp):
-        """Render an image that is attached to all parameters of the scene. Gradients include those of moving edges.
+        """Render an image from which gradients can be computed, with respect to all parameters of the scene.
 
-        `sensor`: a `photograph`, or its index in the scene. Raises ValueError for another kind of sensor and for a
-        variant that is not RGB.
+        Gradients include those of moving edges. `sensor`: a `photograph`, or its index in the scene. `spp`: samples per
+        pixel; 0: as many as the sampler of the sensor says. Returns a tensor (H, W, channels of the film). Raises
+        ValueError for another kind of sensor, and for a variant that is not RGB.
         """
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]

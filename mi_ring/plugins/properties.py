@@ -10,18 +10,19 @@ from mi_ring.errors import LARGEST
 
 
 def beside_scene(name: str) -> Path:
-    """Return the path of the file `name` in a scene: relative to the folder of the scene file.
+    """Return the path of a file that a scene names: relative to the folder of the scene file.
 
-    A scene without a file uses the working folder. The file need not exist.
+    For a scene that was not read from a file, it is relative to the working directory. The file need not exist.
     """
     return Path(str(mi.file_resolver()[0])) / name
 
 
 def number(props, name: str, default: float | None = None, positive: bool = False) -> float:
-    """Read the property `name` of a plugin as a number. `default`: the value if the property is missing.
+    """Read the property `name` of a plugin as a number. `props`: Mitsuba's properties of the plugin.
 
-    Raises ValueError if it is no number, or if its absolute value exceeds 1e18, so that its square is finite in
-    float32. With `positive`, the number must be at least 1e-18, so that 1 / number² is finite, too.
+    `default`: the value if the property is missing; None: a missing property is an error. Raises ValueError if the
+    property is no number, or if its absolute value exceeds 1e18, so that its square is finite in float32. If `positive`
+    is True, the number must be at least 1e-18, so that 1 / number² is finite, too.
     """
     value = props.get(name, default)
     least = 1 / LARGEST if positive else -LARGEST
@@ -34,7 +35,8 @@ def number(props, name: str, default: float | None = None, positive: bool = Fals
 def vector(props, name: str, kind: str) -> np.ndarray | None:
     """Read the property `name` of a plugin as an array (3,). Returns None if the property is missing.
 
-    `kind`: "point" or "vector", for the message. Raises ValueError if the property is not three finite numbers.
+    `props`: Mitsuba's properties of the plugin. `kind`: "point" or "vector", used only in the error message. Raises
+    ValueError if the property is not three finite numbers.
     """
     if name not in props:
         return None
@@ -45,10 +47,10 @@ def vector(props, name: str, kind: str) -> np.ndarray | None:
 
 
 def number_list(props, name: str, counts: Sequence[int]) -> list[float]:
-    """Read the property `name` of a plugin: a string of numbers, separated by spaces or commas.
+    """Read the property `name` of a plugin: a string of numbers, separated by spaces or commas. Returns their list.
 
-    `counts`: how many numbers are allowed, for example (1, 3). Raises ValueError for another count, and for a word that
-    is no number or exceeds 1e18.
+    `props`: Mitsuba's properties of the plugin. `counts`: how many numbers are allowed, for example (1, 3). Raises
+    ValueError for another count, for a word that is no number, and for a number whose absolute value exceeds 1e18.
     """
     text = str(props.get(name, ""))
     try:

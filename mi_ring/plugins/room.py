@@ -15,8 +15,8 @@ from mi_ring.rendering.spherical_harmonics import MAX_ORDER, to_camera_axes
 class Room(InvisibleEmitter):
     """Light from infinitely far away, as spherical harmonics up to order 4 of the direction.
 
-    The light does not move in the world. Or it does not move relative to the camera: this is the light of the room if
-    the object turns on a turntable.
+    The light is fixed in the world, or it is fixed to the camera. The second is the light of the room if the object
+    turns on a turntable in front of a camera that stands still.
 
     ============= ======= ============================================================================= =====
     Parameter     Type    Description                                                                   Flags
@@ -28,8 +28,8 @@ class Room(InvisibleEmitter):
                           `photograph`; then black for other kinds of sensors. Default: ``world``
     ============= ======= ============================================================================= =====
 
-    It lights every photograph, but cameras do not see it: the background stays black. A fit with ``--refine ambient``
-    estimates it. The radiance may be a little below 0 in some directions, because the harmonics are few.
+    The emitter lights every photograph, but cameras do not see it: the background stays black. A fit with ``--refine
+    ambient`` estimates it. The radiance may be a little below 0 in some directions, because the harmonics are few.
 
     What it does not do: importance sampling. Mitsuba's own integrators sample its directions uniformly, so glossy
     surfaces are noisy.

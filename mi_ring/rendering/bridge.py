@@ -11,28 +11,37 @@ from torch.autograd.function import once_differentiable
 
 
 def to_drjit(tensor: Tensor) -> mi.Float:
-    """Convert a tensor to a flat Dr.Jit Float that shares its memory (DLPack). Neither side may write to it."""
+    """Convert a tensor to a flat Dr.Jit Float that shares the tensor's memory (DLPack). Drops gradients.
+
+    Nobody may write to this memory later.
+    """
     return mi.Float(tensor.detach().contiguous().ravel())
 
 
 def to_torch(array: mi.Float) -> Tensor:
-    """Convert a Dr.Jit Float to a tensor (n,) that shares its memory (DLPack). Neither side may write to it."""
+    """Convert a Dr.Jit Float to a tensor (n,) that shares the array's memory (DLPack). Drops gradients.
+
+    Nobody may write to this memory later.
+    """
     return dr.detach(array).torch()
 
 
 def evaluated(arrays: Sequence[mi.Float]) -> list[Tensor]:
-    """Evaluate Dr.Jit Floats together, in one kernel. Returns them as tensors, which `to_torch` makes."""
+    """Evaluate Dr.Jit Floats together, in one kernel. Returns each as a tensor (n,) that shares its memory.
+
+    The tensors have no gradients.
+    """
     dr.eval(arrays)
     return [to_torch(array) for array in arrays]
 
 
 def differentiable(program: Callable, tensors: Sequence[Tensor], target) -> tuple[Tensor, ...]:
-    """Run a Dr.Jit program. Returns its output as tensors (n,) that are differentiable with respect to `tensors`.
+    """Run a Dr.Jit program. Returns its outputs as tensors (n,); torch can compute their gradients by `tensors`.
 
-    `program`: a function from a list of flat Floats to a list of Floats. Its input has the values of `tensors`; it is
-    attached if the tensor requires a gradient. `target`: the object that the program writes its input to; it counts
-    writes in the attribute `written`. The backward pass raises RuntimeError if it runs twice, or if `target` was
-    written again before it.
+    `program`: function from a list of flat Floats, the values of `tensors`, to a list of Floats. An input carries
+    gradients if its tensor requires them. `target`: object whose attribute `written` counts how often `program` has
+    written its inputs to the scene. The backward pass raises RuntimeError if it runs twice, or if that count has grown
+    since.
     """
     return _Differentiable.apply(program, target, *tensors)
 

@@ -10,12 +10,13 @@ MIN_COSINE = 1e-3  #: the least cosine between viewer and normal; smaller ones a
 
 
 def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
-    """Compute the radiance (Color3f) that the surface interactions `si` send to the viewer. It is attached.
+    """Compute the radiance (Color3f) that the surface interactions `si` send to the viewer by direct light.
 
-    `light(si)`: returns (DirectionSample3f, radiance · d⁻²) of the photograph's own light. None: there is no such
-    light. `next_2d`: random numbers; each other emitter of the scene gets one sample. `shadows`: the own light casts
-    shadows; other emitters always do. `rooms`: also sample the scene's `room` emitters; `render_indirect` computes
-    their light with less noise. `room_radiance(si)`: radiance that is added; None: nothing is added.
+    The result is attached (it carries gradients). `light`: function from `si` to (DirectionSample3f, intensity /
+    distance²) of the photograph's own light; None: it has none. `next_2d`: function that returns random points; each
+    emitter of the scene that lights all photographs gets one. `shadows`: the own light casts shadows; the other
+    emitters always do. `rooms`: also sample `room` emitters. `room_radiance`: function from `si` to radiance that is
+    added; None: nothing is added.
     """
     context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
     # At an outline interpolated normals turn away before the faces do. A black strip there would be another edge.
@@ -40,7 +41,10 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
 
 
 def light_visible(scene, si, ds, active=True):
-    """Test whether nothing blocks the light between the surface at `si` and the light, at direction sample `ds`."""
+    """Test whether light reaches the surface interactions `si`. Returns a Dr.Jit mask: True if no shape is in the way.
+
+    `ds`: direction sample toward the light. Without gradients.
+    """
     n, d = dr.detach(si.n), dr.detach(ds.d)
     origin = dr.detach(si.p) + n * dr.mulsign(ray_offset(dr.detach(si.p), dr.detach(si.t)), dr.dot(n, d))
     to_light = dr.detach(ds.p) - origin
@@ -51,9 +55,10 @@ def light_visible(scene, si, ds, active=True):
 
 
 def next_2d(seed, lanes, stream=None):
-    """Make a random number generator for a number of `lanes`: a function that returns new points in [0, 1)².
+    """Make a random number generator: a function that returns new points (Point2f) in [0, 1)² at each call.
 
-    The points of all lanes are independent. `stream` (UInt32): random stream of each lane; default: the lane's number.
+    `lanes`: number of points at each call; those of different lanes are independent. `stream` (UInt32): number of the
+    random stream of each lane; None: the number of the lane.
     """
     # Hashed as in Mitsuba's samplers: without this, neighbouring streams are correlated.
     stream = dr.arange(mi.UInt32, lanes) if stream is None else stream
@@ -63,10 +68,11 @@ def next_2d(seed, lanes, stream=None):
 
 
 def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
-    """Trace camera rays, one per lane. Returns [R, G, B, coverage] of each lane; lanes that are not `active` get 0.
+    """Trace camera rays, one per lane, and shade what they hit. Returns [R, G, B, coverage], with 0 in inactive lanes.
 
-    `view`: photograph of each lane; its light lights the surface. The radiance contains the room's light without
-    occlusion; `render_indirect` computes the occlusion.
+    `view`: index of the photograph of each lane, whose light is used. `next_2d`: function that returns random points.
+    `shadows`: the photographs' own lights cast shadows. The radiance contains the light of the room as if nothing
+    blocked it. Coverage is 1 where a ray hits a shape.
     """
     shadows = shadows and photographs.casts_shadows
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)

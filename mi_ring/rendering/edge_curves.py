@@ -1,8 +1,8 @@
 """Edges as curves in space: samples of them, and the outlines and borders of shapes that are not meshes.
 
-`CURVES` has functions for the curves of these shapes, in local coordinates. Their arguments are the eye e, which is a
-point if w = 1 and a direction if w = 0, then w, and the curve parameter t in [0, 1). They return (point p, dp/dt, a
-point of the shape beside p).
+`CURVES` has the functions of these curves for each kind of shape, in the shape's coordinates. Their arguments: `e`, the
+position of a camera or light (`w` = 1) or the direction toward it (`w` = 0), and the curve parameter `t` in [0, 1).
+They return (point of the curve, its derivative with respect to `t`, a point of the shape beside the curve).
 """
 
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ OUTLINE_OFFSET, SHADOW_OFFSET = 1e-4, 1e-2
 
 
 def ray_offset(point, distance):
-    """Compute at which distance from `point` a ray must start so that it does not hit the surface that it leaves.
+    """Compute at which distance from `point` a ray must start so that it does not hit the surface on which it starts.
 
-    The distance [scene units] is proportional to the rounding error of the point. `distance`: length of the ray that
-    has found the point.
+    `distance`: length of the ray that found the point. The result [scene units] is proportional to the rounding error
+    of the point.
     """
     return RELATIVE_OFFSET * (dr.max(dr.abs(point)) + distance)
 
 
 @dataclass
 class EdgeSamples:
-    """Samples of curves in space, one per lane: outlines, creases and borders of shapes in several photographs."""
+    """Samples of curves in space, one per lane. The curves are outlines, creases, borders and edges of shadows."""
 
     view: mi.UInt32  #: the photograph
     lane: mi.UInt32  #: the number of the sample, the same whichever photographs are rendered together
@@ -43,16 +43,19 @@ class EdgeSamples:
 # Curves of such shapes in local coordinates: (p, dp/dt, a point of the shape beside p) as functions of t in [0, 1) and
 # of the eye e, which is a point for w = 1 and a direction for w = 0.
 def circle(u, v, t):
-    """Evaluate the unit circle in the plane of the unit vectors `u` and `v` at the parameter `t` in [0, 1).
+    """Evaluate a unit circle at parameter `t` in [0, 1). Returns (point, derivative with respect to `t`).
 
-    Returns (point, derivative with respect to `t`).
+    `u`, `v`: orthogonal unit vectors in the plane of the circle, whose centre is the origin.
     """
     s, c = dr.sincos(2 * dr.pi * t)
     return u * c + v * s, 2 * dr.pi * (v * c - u * s)
 
 
 def square_border(e, w, t):
-    """Evaluate the border of the square [-1, 1]². Arguments and result: see the docstring of the module."""
+    """Evaluate the border of the square [-1, 1]² at parameter `t` in [0, 1).
+
+    Returns (point, derivative with respect to `t`, a point inside). The viewpoint `e`, `w` does not matter.
+    """
     side, along = dr.floor(4 * t), 8 * (t - 0.25 * dr.floor(4 * t)) - 1
     x = dr.select(side == 0, along, dr.select(side == 1, 1, dr.select(side == 2, -along, -1)))
     y = dr.select(side == 0, -1, dr.select(side == 1, along, dr.select(side == 2, 1, -along)))
@@ -62,21 +65,29 @@ def square_border(e, w, t):
 
 
 def disk_border(e, w, t):
-    """Evaluate the border of the unit disk. Arguments and result: see the docstring of the module."""
+    """Evaluate the border of the unit disk at parameter `t` in [0, 1).
+
+    Returns (point, derivative with respect to `t`, a point inside). The viewpoint `e`, `w` does not matter.
+    """
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
     return mi.Point3f(p), dp, mi.Point3f(0)
 
 
 def cylinder_border(e, w, t, z):
-    """Evaluate the circle at the end `z` of the unit cylinder. Other arguments and result: see the module."""
+    """Evaluate the circle at the end `z` (0 or 1) of the unit cylinder at parameter `t` in [0, 1).
+
+    Returns (point, derivative with respect to `t`, a point of the cylinder). The viewpoint `e`, `w` does not matter.
+    """
     p, dp = circle(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), t)
     return mi.Point3f(p.x, p.y, z), dp, mi.Point3f(p.x, p.y, 0.5)
 
 
 def sphere_outline(e, w, t):
-    """Evaluate the outline of the unit sphere: points p with p · e = w, whose normal is perpendicular to the view.
+    """Evaluate the outline of the unit sphere at parameter `t` in [0, 1), for a viewpoint outside of it.
 
-    Arguments and result: see the docstring of the module.
+    `e`: position of the viewpoint (`w` = 1), or direction toward it (`w` = 0). The outline has the points p with p · e
+    = w: their normals are perpendicular to the line of sight. Returns (point, derivative with respect to `t`, a point
+    inside).
     """
     e2 = dr.squared_norm(e)
     frame = mi.Frame3f(e * dr.rsqrt(e2))
@@ -86,9 +97,10 @@ def sphere_outline(e, w, t):
 
 
 def cylinder_outline(e, w, t, side=1.0):
-    """Evaluate one of the two lines in the outline of the cylinder x² + y² = 1, 0 < z < 1. `side`, 1 or -1, says which.
+    """Evaluate one of the two straight outlines of the cylinder x² + y² = 1, 0 < z < 1, at parameter `t` in [0, 1).
 
-    Other arguments and result: see the docstring of the module.
+    `e`: position of the viewpoint (`w` = 1), or direction toward it (`w` = 0). `side`: 1 or -1, for the one or the
+    other line. Returns (point, derivative with respect to `t`, a point inside).
     """
     e2 = e.x * e.x + e.y * e.y
     r = side * dr.sqrt(dr.maximum(1 - w * w / e2, 0)) * dr.rsqrt(e2)
@@ -110,9 +122,11 @@ CURVES = {
 
 
 def outline_of(shape, eye, views, seed, before=0) -> list[EdgeSamples]:
-    """Sample outline and border of a shape that is not a mesh, for the `eye` in each of `views` photographs.
+    """Sample the outline and border curves of a shape that is not a mesh. Returns samples for each curve of the shape.
 
-    Returns samples for each curve of the shape. `eye`: see `Edges`. `before`: see `Photographs.before`.
+    `eye`: viewpoint, a function from photograph indices (UInt32) to (position, True) or (direction toward it, False).
+    `views`: number of photographs. `before`: number of photographs before these that are rendered elsewhere; random
+    numbers depend on it.
     """
     to_world = mi.traverse(shape)["to_world"]
     curves = []

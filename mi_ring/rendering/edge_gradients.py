@@ -1,4 +1,4 @@
-"""The boundary terms of a photograph's gradient. They are the part of the gradient that comes from moving edges."""
+"""The part of a photograph's gradient that comes from moving edges: its boundary terms."""
 
 import drjit as dr
 import mitsuba as mi
@@ -11,16 +11,17 @@ EDGE_ROUNDINGS = 16  #: the least distance to rays beside an edge, in rounding e
 
 
 def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
-    """Compute the boundary terms of photographs. Returns one tuple (where [px], view, step, active) for each curve.
+    """Compute the gradient of photographs by moving edges. Returns a tuple (where, view, step, active) for each curve.
 
-    Each entry of the tuple has one value per sample of the curve: pixel coordinates, photograph, gradient, and whether
-    the sample counts. `step`, [R, G, B, coverage], is zero, but its derivative is the boundary term dI; the caller adds
-    it to the pixel at `where`.
+    Each entry has one value per sample of the curve: `where`, pixel coordinates; `view`, index of the photograph;
+    `step`, [R, G, B, coverage] to add to the pixel at `where`; `active`, False for samples to ignore. The values of
+    `step` are 0. Their derivative dI is the boundary term. Let n be the normal of the edge in the picture. If the edge
+    moves by dq [px], it sweeps length · n·dq square pixels. There, the radiance changes from L_beyond, on the side to
+    which n points, to L_before, on the other side. So dI = (L_before − L_beyond) · n·dq · length. Both radiances are
+    traced along rays beside the edge, with occlusion, background, coverage and shadows as in the picture.
 
-    An edge that moves by n·dq [px] sweeps length · n·dq square pixels. There, the radiance changes from L_beyond to
-    L_before. So dI = (L_before − L_beyond) · n·dq · length. Both radiances are traced along rays beside the edge, with
-    occlusion, background, coverage and shadows as in the picture. `edges`: the `Edges` of the scene. `window`: (lowest,
-    highest) corner [px] of the rendered part, default: all; edges outside of it are skipped.
+    `edges`: the edges of the scene. `shadows`: also edges of shadows. `window`: (lowest, highest) corner [px] of the
+    part that is rendered; edges outside of it are skipped; None: all is rendered.
     """
     window = window or (mi.Point2f(0), mi.Point2f(photographs.size))
     views, before = len(photographs), photographs.before
@@ -36,7 +37,12 @@ def boundary_terms(scene, photographs, edges, seed, shadows=True, window=None):
 
 
 def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window):
-    """Compute the tuple of `boundary_terms` for one curve. Returns None if no gradient is wanted for its motion."""
+    """Compute the gradient of photographs by the motion of one curve. Returns None if the motion has no gradient.
+
+    Otherwise returns (pixel coordinates, index of the photograph, [R, G, B, coverage] whose value is 0 and whose
+    derivative is the boundary term, mask of the samples that count), with one value per sample. `shadows`: trace
+    shadows. `window`: (lowest, highest) corner [px] of the part that is rendered.
+    """
     camera = photographs.camera(curve.view)
     where, depth = camera.project(curve.point)
     if not dr.grad_enabled(where):
@@ -72,10 +78,11 @@ def boundary_term(scene, photographs, curve: EdgeSamples, seed, shadows, window)
 
 
 def cast_shadow(scene, curve: EdgeSamples, light, camera) -> EdgeSamples:
-    """Project a curve along rays from the light onto the scene. The result is the edge of the shadow that it casts.
+    """Project a curve from the light onto the scene. Returns the edge of the shadow that the curve casts.
 
-    The result is attached to the light, to the curve and to the surface under the shadow. `light`, `camera`: eyes; see
-    `Edges`.
+    `curve`: samples of an outline as seen from the light. `light`, `camera`: functions from photograph indices (UInt32)
+    to (position, True) or (direction toward it, False). The result is attached to light, curve and the surface that is
+    in shadow. Samples whose shadow the camera does not see are inactive.
     """
     where, finite = light(curve.view)
     d = dr.normalize(dr.select(finite, curve.point - where, -where))

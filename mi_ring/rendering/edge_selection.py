@@ -1,4 +1,4 @@
-"""Finds the edges at which a photograph is discontinuous: outlines, creases and edges of shadows."""
+"""Finds the edges at which the picture is discontinuous: outlines, creases and edges of shadows."""
 
 import drjit as dr
 import mitsuba as mi
@@ -12,12 +12,11 @@ SAMPLES, MIN_SAMPLES = 4, 2048  #: per edge of a mesh, and at least for all edge
 
 
 class Edges:
-    """The edges of all shapes in a scene. The methods find the edges that are outlines for an eye.
+    """The edges of all shapes in a scene. Methods find those that are discontinuities as seen from an eye.
 
-    An eye is a camera or a light. It is given as a function of the photograph (UInt32), which returns (Vector3f, Bool):
-    (position, True), or (direction toward it, False) for an infinitely distant eye. The result may be attached.
-
-    Raises SceneError if the scene has a shape of a kind whose outline is not known.
+    An eye is the camera or the light of each photograph, given as a function: it takes indices of photographs (UInt32)
+    and returns (position, True), or (direction toward it, False) for a distant light. The vectors may carry gradients.
+    Raises SceneError if a shape is neither a mesh nor a rectangle, disk, sphere or cylinder.
     """
 
     def __init__(self, scene):
@@ -47,9 +46,10 @@ class Edges:
 
     @classmethod
     def of(cls, scene, known: "Edges | None" = None) -> "Edges":
-        """Find the edges of a scene. `known`: edges from an earlier call.
+        """Return the edges of a scene. `known`: edges from an earlier call, or None.
 
-        Returns `known` itself if they belong to this scene and its shapes and triangles have not changed since.
+        If `known` belongs to this scene and its shapes and triangles have not changed since, returns `known` itself.
+        Vertices may have moved.
         """
         if known is not None and list(scene.shapes()) == known.shapes:
             now = (mesh.faces_buffer() for mesh in known.meshes)
@@ -58,14 +58,16 @@ class Edges:
         return cls(scene)
 
     def positions(self):
-        """Return the vertex positions of all meshes as one Float. It is attached."""
+        """Return the vertex positions of all meshes as one flat Float. It is attached (it carries gradients)."""
         buffers = [mesh.vertex_positions_buffer() for mesh in self.meshes]
         return buffers[0] if len(buffers) == 1 else dr.concat(buffers)
 
     def fronts(self, eye, views):
-        """Test which triangles face the eye in each of `views` photographs.
+        """Test which triangles face the eye. Returns a Dr.Jit Bool for each triangle of the meshes in each photograph.
 
-        Returns Bool: the values of all triangles for photograph 0, then the values for photograph 1, and so on.
+        `eye`: function from photograph indices to (position, True) or (direction toward it, False). `views`: number of
+        photographs. The result has the values of all triangles for photograph 0, then for photograph 1, and so on.
+        True: the triangle shows its front side to the eye.
         """
         count = dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views)
@@ -78,10 +80,11 @@ class Edges:
         return front
 
     def sides(self, fronts, lanes=None, views=1):
-        """Return for each lane (edge, whether its first triangle faces the eye, whether its second triangle does).
+        """Look up whether the two triangles at edges face the eye (camera or light). Returns (edge, first, second).
 
-        `fronts`: result of `fronts`. `lanes` (UInt32): photograph · number of edges + edge. Default: all edges in
-        `views` photographs.
+        These have one value per lane: the number of the edge, and for its first and second triangle True if it faces
+        the eye. `fronts`: a Bool for each triangle in each photograph, one photograph after the other: True if it faces
+        the eye. `lanes` (UInt32): photograph · number of edges + edge; None: all edges in `views` photographs.
         """
         count, triangles = dr.width(self.kind), dr.width(self.corners) // 3
         lane = dr.arange(mi.UInt32, count * views) if lanes is None else lanes
@@ -92,9 +95,10 @@ class Edges:
         return edge, first, second
 
     def sample(self, lanes, seed, before=0, shadow=False) -> EdgeSamples:
-        """Choose random points on edges, stratified along each edge. Returns at least four per edge.
+        """Choose random points on edges, stratified along each edge. Returns at least four points per edge.
 
-        `lanes`: the edges, see `sides`. `before`: see `Photographs.before`. `shadow`: the edges are edges of shadows.
+        `lanes` (UInt32): photograph · number of edges + edge. `before`: number of photographs before these that are
+        rendered elsewhere; random numbers depend on it. `shadow`: True if the edges are edges of shadows.
         """
         count = dr.width(self.kind)
         each = max(SAMPLES, MIN_SAMPLES // count)
@@ -110,7 +114,10 @@ class Edges:
         return EdgeSamples(chosen // count, lane, p, piece, self.middle(edge), mi.Bool(True), OUTLINE_OFFSET, shadow)
 
     def middle(self, edge):
-        """Return the mean of the centres of both triangles at an edge. It is detached."""
+        """Return the mean of the centres of the two triangles at each edge, Point3f without gradients.
+
+        `edge` (UInt32): numbers of edges. At a border, it is the centre of the one triangle.
+        """
         positions, corners = dr.detach(self.positions()), mi.Point3f(0)
         for face in (self.f0, self.f1):
             for vertex in dr.gather(mi.Point3u, self.corners, dr.gather(mi.UInt32, face, edge)):
@@ -118,9 +125,12 @@ class Edges:
         return corners
 
     def outlines(self, eye, views, seed, before=0):
-        """Sample all edges that may be outlines or creases for the `eye` in `views` photographs.
+        """Sample all edges that may be outlines or creases as seen from the eye. Returns (list of samples, fronts).
 
-        Returns (list of samples of curves; result of `fronts` for this eye, None if the scene has no mesh).
+        The list has an entry for each curve of a shape, and one for all meshes. `fronts`: a Bool for each triangle in
+        each photograph, True if it faces the eye; None if the scene has no mesh. `eye`: function from photograph
+        indices to (position, True) or (direction toward it, False). `views`: number of photographs. `before`: number of
+        photographs before these that are rendered elsewhere; random numbers depend on it.
         """
         curves = [curve for shape in self.others for curve in outline_of(shape, eye, views, seed, before)]
         fronts = None
@@ -134,12 +144,16 @@ class Edges:
         return curves, fronts
 
     def shadow_casters(self, light, views, seed, seen, before=0):
-        """Sample the edges that make edges of shadows: those that cast a shadow (casters), and terminators.
+        """Sample the edges of shapes that cause edges of shadows. Returns (casters, terminators), two lists of samples.
 
-        Returns (casters, terminators) for the eye `light`, two lists of samples of curves. Casters are the outlines as
-        seen from the light. Terminators are casters of which the camera sees both triangles: they separate lit and
-        unlit triangles. The unlit triangle is black, even where interpolated normals face the light. `seen`: result of
-        `fronts` for the cameras.
+        Casters are outlines as seen from the light; their shadows fall onto other surfaces. A terminator is a caster of
+        a mesh at which the camera sees both adjacent triangles: the shadow begins at this edge itself, because one
+        triangle faces the light and the other does not and is black.
+
+        `light`: function from photograph indices to (position, True) or (direction toward it, False). `views`: number
+        of photographs. `seen`: a Bool for each triangle in each photograph, one photograph after the other: True if the
+        triangle faces the camera. `before`: number of photographs before these that are rendered elsewhere; random
+        numbers depend on it.
         """
         casters = [curve for shape in self.others for curve in outline_of(shape, light, views, seed, before)]
         terminators = []
@@ -158,10 +172,11 @@ class Edges:
 
 
 def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
-    """Find the E edges of a mesh. `faces`: (F, 3). Returns (5, E).
+    """Find the E edges of a mesh with the triangles `faces` (F, 3). Returns an integer array (5, E).
 
-    The rows are: vertex v0, vertex v1, the triangle with the side (v0, v1), the triangle with the side (v1, v0), and
-    the kind of the edge: SMOOTH, CREASE or BORDER.
+    Its rows: first vertex v0, second vertex v1, the triangle that has the side (v0, v1), the triangle that has the side
+    (v1, v0), and the kind of the edge. SMOOTH: normals agree across the edge. CREASE: they differ. BORDER: there is
+    only one triangle, which is in both rows. Duplicated vertices at the same position count as one.
     """
     weld = np.arange(mesh.vertex_count())
     table = paired_edges(faces, weld)
@@ -175,7 +190,13 @@ def edge_table(mesh, faces: np.ndarray) -> np.ndarray:
 
 
 def paired_edges(faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
-    """Make the `edge_table` of a mesh with smooth normals. `weld` (V,): vertices with equal numbers are one point."""
+    """Find the E edges of a mesh with smooth normals and triangles `faces` (F, 3). Returns an integer array (5, E).
+
+    `weld` (V,): vertices with equal numbers are one point. The rows: first vertex v0, second vertex v1, the triangle
+    that has the side (v0, v1), the triangle that has the side (v1, v0), and the kind. SMOOTH: the triangles share both
+    vertices. CREASE: they share points, but not both vertices. BORDER: there is only one triangle, which is in both
+    rows.
+    """
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, 1).ravel().astype(np.int64)
     triangle = np.repeat(np.arange(len(faces)), 3)
     a, b = weld[start], weld[end]

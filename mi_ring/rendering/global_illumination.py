@@ -1,4 +1,4 @@
-"""Interreflection and the light of the room: rendered in small pictures, and then added to the large pictures."""
+"""Interreflection and the light of the room: rendered in small pictures, which are enlarged for the photographs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ TABLE_WIDTH, TABLE_PATHS = 128, 3  #: the same with a table, whose pattern gloss
 class GlobalIllumination:
     """Interreflection and room light of N photographs, rendered as small pictures of h × w pixels.
 
-    Methods scale the small pictures up to H × W pixels, the size at which direct light is rendered. `transfer` is the
-    radiance transfer of "Precomputed Radiance Transfer" (Sloan, Kautz and Snyder 2002).
+    Methods enlarge these to H × W pixels, the size at which direct light is rendered. `transfer` is the radiance
+    transfer of "Precomputed Radiance Transfer" (Sloan, Kautz and Snyder 2002).
     """
 
     radiance: Tensor  #: (N, h, w, 3) of interreflection
@@ -39,14 +39,13 @@ class GlobalIllumination:
         cls, surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int | None = None,
         paths: int | None = None, indirect: bool = True, harmonics: Sequence[int] = (),
     ) -> "GlobalIllumination":  # fmt: skip
-        """Render interreflection and the `transfer` of `harmonics` for the current surface, without gradients.
+        """Render small pictures of interreflection and room light for the current surface, without gradients.
 
-        `photographs`: the N photographs. `coverage` (N, H, W): coverage in the large pictures. `width`: largest width
-        of the small pictures [px]. `paths`: paths per pixel. This light varies slowly, so a few good pixels are better
-        than many noisy ones. The defaults of `width` and `paths` depend on whether the scene has a table.
-
-        `indirect`: if it is false, `transfer` contains only room light that the surface reflects once; do not use
-        `interreflection` then.
+        `photographs`: the N photographs. `coverage` (N, H, W): their coverage, rendered at full size. `width`: largest
+        side of the small pictures [px]. `paths`: paths per pixel. If these are None: 32 px and 16 paths, or 128 px and
+        3 paths if the scene has a table. This light varies slowly, so a few good pixels are better than many noisy
+        ones. `indirect`: False: no interreflection; the room light then has its occlusion, but is reflected only once.
+        `harmonics`: indices of the spherical harmonics of room light; empty: no room light.
         """
         bounces = BOUNCES if indirect else 1
         table = surface.table if indirect else None  # a table reflects light; alone it would hide the room's
@@ -62,31 +61,35 @@ class GlobalIllumination:
 
     @property
     def interreflection(self) -> Tensor:
-        """The linear radiance (N, H, W, 3) that interreflection adds to the large pictures."""
+        """Linear radiance (N, H, W, 3) that interreflection adds to the photographs at full size.
+
+        Interreflection of room light is not included.
+        """
         return self.upsampled(self.radiance)
 
     def room_light(self, room: Tensor) -> Tensor:
-        """Compute the linear radiance (N, H, W, 3) that room light adds to the large pictures.
+        """Compute the linear radiance (N, H, W, 3) that room light adds to the photographs at full size.
 
-        `room` (BASIS, 3): spherical harmonics of the room light.
+        It includes the shadows of the room light. `room` (BASIS, 3): spherical harmonics of the room light; only those
+        in `harmonics` count.
         """
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
 
     def occlusion(self, room: Tensor) -> Tensor:
-        """Compute the radiance (N, H, W, 3) to add to large pictures that contain room light without occlusion.
+        """Compute what to add to photographs at full size that contain room light as if nothing blocked it.
 
-        It corrects them for the shadows of the room light, which are negative, and for its interreflection. `room`
-        (BASIS, 3): spherical harmonics of the room light.
+        Returns linear radiance (N, H, W, 3): the shadows of the room light, as negative values, and its
+        interreflection. `room` (BASIS, 3): spherical harmonics of the room light; only those in `harmonics` count.
         """
         difference = self.transfer - self.unoccluded
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))
 
     def upsampled(self, rgb: Tensor) -> Tensor:
-        """Scale small pictures (N, h, w, 3) up to (N, H, W, 3), with the outlines of the large pictures.
+        """Enlarge small pictures `rgb` (N, h, w, 3) to the photographs' full size (N, H, W, 3), with sharp outlines.
 
-        The result has a gradient with respect to `coverage` only: this light acts on the outline, but not on shape and
-        material. Successive iterations of a fit take it into account for shape and material, as in "Shape from
-        Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
+        The outlines come from `coverage`, and the result has gradients with respect to `coverage` only: this light acts
+        on the outline, but not on shape and material. A fit takes it into account for shape and material by its
+        iterations, as in "Shape from Interreflections" (Nayar, Ikeuchi and Kanade, IJCV 1991).
         """
         images = torch.cat([rgb, self.alpha[..., None]], -1).movedim(-1, 1)
         images = blur(images.flatten(0, 1), 1.0).reshape(images.shape)

@@ -1,4 +1,4 @@
-"""Image formation: renders photographs of a scene, each under its own light, and maps of the surface."""
+"""Renders photographs of a scene, each under its own light, and maps of normals and materials."""
 
 import drjit as dr
 import mitsuba as mi
@@ -9,12 +9,12 @@ from mi_ring.rendering.photographs import center_rays, pixel_rays
 
 
 def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, pixels=None):
-    """Render the selected photographs together. Returns [R, G, B, coverage], attached Floats of N·H·W pixels.
+    """Render the N selected photographs together. Returns [R, G, B, coverage], Floats of N·H·W pixels.
 
-    R, G, B are box-filtered linear radiance. `spp`: samples per pixel. `shadows`: the photographs' own lights cast
-    shadows. `edges`: the `Edges` of the scene; gradients then contain the boundary terms of moving edges. If it is
-    None, gradients contain only shading. `pixels`: render only this range of pixels (first, last + 1), numbered through
-    all photographs; do not give it together with `edges`.
+    R, G, B are linear radiance, the mean over each pixel. The result is attached (it carries gradients). `spp`: samples
+    per pixel. `shadows`: the photographs' own lights cast shadows. `edges`: the edges of the scene; gradients then
+    include moving outlines and shadows; None: gradients of shading only. `pixels`: render only this range of pixels
+    (first, last + 1), numbered through all photographs; None: all. Do not give it together with `edges`.
     """
     ray, view = pixel_rays(photographs, spp, seed, pixels)
     lane = dr.arange(mi.UInt32, dr.width(ray)) + photographs.first_lane(spp, pixels[0] if pixels else 0)
@@ -34,11 +34,11 @@ def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, 
 
 
 def render_maps(scene, photographs, attributes, pixels=None):
-    """Render normals and mesh attributes at the centres of pixels.
+    """Render normals and mesh attributes at pixel centres. Returns [nx, ny, nz, first attribute, …].
 
-    `attributes`: number of channels by name of the attribute. `pixels`: as in `render_photographs`. Returns Floats of
-    N·H·W pixels, [nx, ny, nz, first attribute, …]. Normals are in world space. Pixels that show no surface, or a
-    surface without the attribute, are 0.
+    These are Floats of N·H·W pixels for the N selected photographs. Normals are in world space. Values are 0 where a
+    pixel shows no surface, or a surface without the attribute. `attributes`: number of channels (1 or 3) by name of the
+    attribute. `pixels`: range of pixels (first, last + 1), numbered through all photographs; None: all.
     """
     si = scene.ray_intersect(center_rays(photographs, pixels)[0])
     maps = [dr.select(si.is_valid(), n, 0) for n in si.sh_frame.n]

@@ -1,4 +1,4 @@
-"""Indirect light: path traces interreflection and the light of the room with its occlusion, without gradients."""
+"""Indirect light: path traces interreflection, and the light of the room with its shadows. It computes no gradients."""
 
 import drjit as dr
 import mitsuba as mi
@@ -14,15 +14,13 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
     """Render interreflection. Returns [R, G, B, coverage], Floats of N·H·W pixels without gradients.
 
     R, G, B are linear radiance. Paths start at the camera and sample BSDFs. After the first point, a path has at most
-    `bounces` points. At each of these, the direct light is added; there the own light of each photograph casts shadows.
-    The result is unbiased except for the missing longer paths. `table`: a scene of tables; paths can hit it after their
-    first point, but it casts no shadows.
+    `bounces` points. At each of these points, direct light is added, with shadows. The result is unbiased except that
+    longer paths are missing. `spp`: paths per pixel. `table`: a scene of tables, which paths can hit after their first
+    point; it casts no shadows. None: no table.
 
     `harmonics`: n indices of spherical harmonics. For these, 6 n more Floats follow. The first 3 n are R, G, B of the
     radiance transfer of each harmonic: the radiance of the surface in a room whose radiance is this harmonic, with
-    occlusion and with paths of at most `bounces` points. The last 3 n are the same without occlusion and
-    interreflection; see `reflected_harmonics`. These have no noise. In the first 3 n, only occlusion and
-    interreflection have noise.
+    shadows and interreflection. The last 3 n are the same without shadows and interreflection, and have no noise.
     """
     with dr.suspend_grad():
         ray, view = pixel_rays(photographs, spp, seed)
@@ -56,14 +54,14 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
 def trace_paths(scene, si, view, photographs, bounces, random, table=None, known=()):
     """Trace one path per lane for the light that arrives at the surface interactions `si` from other surfaces.
 
-    Returns (radiance, escaped, blocked). `radiance` is the part of this light that `si` reflects to the viewer.
-    `escaped` is (throughput, direction) of the paths that leave the scene. `blocked` is (throughput, direction) of the
-    paths that start at a BSDF in `known` and hit another surface directly after `si`. All other paths have the
-    throughput 0.
+    Returns (radiance, escaped, blocked). `radiance`: this light, reflected by `si` to the viewer. `escaped`:
+    (throughput, direction) of paths that leave the scene. `blocked`: (throughput, direction) of paths that start at a
+    BSDF in `known` and hit another surface directly after `si`. Throughputs of all other paths are 0.
 
-    `random`: function that returns 2-D samples. `known`: BSDFs whose room light without occlusion the caller adds by
-    `reflected_harmonics`. So `escaped` does not contain their paths that leave the scene directly after `si`, and the
-    caller subtracts the light of `blocked`.
+    `view`: index of the photograph of each lane. `bounces`: number of points of a path after `si`. `random`: function
+    that returns random points in [0, 1)². `table`: a scene of tables, which paths can also hit; None: no table.
+    `known`: BSDFs whose room light without shadows the caller computes in closed form. So `escaped` omits their paths
+    that leave the scene directly after `si`, and the caller must subtract the room light of `blocked`.
     """
     context, active = mi.BSDFContext(), si.is_valid()
     radiance, throughput = mi.Color3f(0), mi.Color3f(1)
@@ -96,6 +94,6 @@ def trace_paths(scene, si, view, photographs, bounces, random, table=None, known
 
 
 def separate_kernels(values) -> None:
-    """On a GPU, evaluate `values` now: OptiX cannot trace rays through two scenes in one kernel."""
+    """On a GPU, evaluate `values` (Dr.Jit arrays) now: OptiX cannot trace rays through two scenes in one kernel."""
     if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
         dr.eval(values)

@@ -46,7 +46,11 @@ class MerlTable:
         self.texture = mi.Texture3f(tensor, wrap_mode=dr.WrapMode.Clamp)
 
     def value(self, theta, d):
-        """Evaluate the BRDF as Color3f [1/sr]. `theta`: angle θh of the half vector [rad]. `d`: difference vector."""
+        """Evaluate the BRDF. Returns Color3f [1/sr].
+
+        `theta`: angle θh between normal and half vector [rad]. `d`: difference vector of Rusinkiewicz, the direction to
+        the viewer in the frame of the half vector.
+        """
         half = dr.sqrt(dr.clip(theta / (dr.pi / 2), 0, 1)) * CELLS[0]
         difference = dr.acos(dr.clip(d.z, 0, 1)) / (dr.pi / 2) * CELLS[1]
         turn = dr.atan2(d.y, d.x) / dr.pi
@@ -59,7 +63,8 @@ class MerlTable:
 class MerlNetwork:
     """A network of 6-21-21-3 neurons that was fitted to a table ("Neural BRDF Representation", Sztrajman 2021).
 
-    Raises InputError if the file contains no such networks, and for an unknown material.
+    `path`: an NPZ file of networks. `material`: name of one of them. Raises InputError if the file contains no such
+    networks, and for an unknown material.
     """
 
     def __init__(self, path: Path, material: str):
@@ -77,7 +82,11 @@ class MerlNetwork:
         self.layers = [arrays[name][names.index(material)].astype(float).tolist() for name in LAYERS]
 
     def value(self, theta, d):
-        """Evaluate the BRDF. Arguments and result: as for `MerlTable.value`."""
+        """Evaluate the BRDF. Returns Color3f [1/sr].
+
+        `theta`: angle θh between normal and half vector [rad]. `d`: difference vector of Rusinkiewicz, the direction to
+        the viewer in the frame of the half vector. Angles outside of the fitted range are clamped.
+        """
         theta = dr.minimum(theta, float(FITTED_ANGLES[0]))
         sin = dr.sqrt(dr.maximum(1 - d.z * d.z, 0))
         narrowed = dr.minimum(sin, float(np.sin(FITTED_ANGLES[1])))
@@ -90,7 +99,7 @@ class MerlNetwork:
 
 
 def dense_layer(x: list, weights: list, biases: list) -> list:
-    """Multiply x (n) by weights (n, m) and add biases (m). Returns a list of m Floats.
+    """Multiply the n Floats `x` by `weights` (n, m), and add `biases` (m). Returns a list of m Floats.
 
     Dr.Jit's own layers need half precision on a GPU.
     """

@@ -1,4 +1,4 @@
-"""The lights of many photographs as Dr.Jit buffers, and the light that a surface receives from each of them."""
+"""The lights of many photographs as Dr.Jit buffers, and the irradiance by each of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ DISTANT = 1e9  #: distance of a directional light [scene units]
 
 @dataclass(frozen=True)
 class Lights:
-    """The light of each of N photographs, as Dr.Jit buffers that may be attached."""
+    """The own light of each of N photographs, as Dr.Jit buffers that may carry gradients."""
 
     places: object  #: Float, 3 per light: position [scene units], or unit direction toward a distant light
     finite: object  #: Bool: is it a point light? Else it is distant
@@ -25,9 +25,9 @@ class Lights:
 
     @classmethod
     def of(cls, shots: Sequence[Shot]) -> "Lights":
-        """Collect the lights of photographs.
+        """Collect the own lights of photographs. One without a light gets a point light of intensity 1 at its camera.
 
-        Raises SceneError if a light is not finite or negative, or if some lights are black but not all.
+        Raises SceneError if a light has infinite or negative values, or if some lights are black but not all.
         """
         lights = [shot.own_light for shot in shots]
         finite = np.array([light.kind == "point" for light in lights])
@@ -48,19 +48,22 @@ class Lights:
 
     @classmethod
     def attached(cls, emitter) -> "Lights":
-        """Make the buffers of one point or directional emitter. They are attached to the emitter's parameters."""
+        """Make the buffers of one Mitsuba emitter, point or directional. They carry gradients of its parameters."""
         place, finite = position_of(emitter)
         return cls(dr.concat(list(place)), mi.Bool(finite), dr.concat(list(strength_of(emitter))))
 
     def eye(self, k):
-        """Return light `k` as an eye; see `Edges`. `k`: one number per lane."""
+        """Return where lights are: (position, True), or (direction toward the light, False) for a directional light.
+
+        `k` (UInt32): index of the light for each lane.
+        """
         return dr.gather(mi.Vector3f, self.places, k), dr.gather(mi.Bool, self.finite, k)
 
     def sample(self, k, si):
-        """Compute the light that arrives at the surface interactions `si`, if nothing is in its way.
+        """Compute the light that arrives at the surface interactions `si` if nothing is in its way.
 
-        `k`: index of the light, one for each interaction. Returns (the direction to the light as DirectionSample3f,
-        irradiance of a surface that faces it). For a point light the latter is its intensity / distance².
+        `k` (UInt32): index of the light for each interaction. Returns (DirectionSample3f toward the light, irradiance
+        (Color3f) of a surface that faces the light: intensity / distance² for a point light).
         """
         where, finite = self.eye(k)
         strength = dr.gather(mi.Color3f, self.strengths, k)
@@ -80,15 +83,15 @@ class Lights:
         return Light("point", place, rgb) if self.is_finite()[k] else Light("directional", -place, rgb)
 
     def is_finite(self) -> np.ndarray:
-        """Test which lights are point lights. Returns (N,) bool. The others are distant."""
+        """Test which lights are point lights. Returns (N,) bool: True for point lights, False for distant lights."""
         return np.array(self.finite)
 
     def positions(self) -> np.ndarray:
-        """Return the positions (N, 3) [scene units]; for distant lights, unit directions toward them."""
+        """Return the positions (N, 3) of the lights [scene units]; for distant lights, unit directions toward them."""
         return np.array(self.places).reshape(-1, 3).astype(float)
 
     def rgb(self) -> np.ndarray:
-        """Return the intensities (N, 3) [W/sr]; for distant lights, irradiances [W/m²]."""
+        """Return the RGB intensities (N, 3) of the lights [W/sr]; for distant lights, their irradiances [W/m²]."""
         return np.array(self.strengths).reshape(-1, 3).astype(float)
 
     def toward(self, point: np.ndarray) -> np.ndarray:
@@ -97,30 +100,31 @@ class Lights:
         return np.where(self.is_finite()[:, None], places - point, places)
 
     def distances(self, point: np.ndarray) -> np.ndarray:
-        """Return the distances (N,) of the lights from a point (3,) [scene units]; infinite for distant lights."""
+        """Return the distances (N,) from `point` (3,) to the lights [scene units]; infinite for distant lights."""
         return np.where(self.is_finite(), np.linalg.norm(self.toward(point), axis=1), np.inf)
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """Compute the irradiance (N, 3) of each light at `point` (3,), on a surface that faces the light.
+        """Compute the RGB irradiance (N, 3) by each light at `point` (3,), on a surface that faces this light.
 
-        It is intensity / d² in equation 2.
+        For a point light, it is intensity / distance².
         """
         distance2 = np.where(self.is_finite(), np.maximum((self.toward(point) ** 2).sum(1), 1e-24), 1.0)
         return self.rgb() / distance2[:, None]
 
 
 def flash_falloff(direction, to_world, falloff):
-    """Compute the factor by which a flash is weaker away from its axis: (cosine of the angle to the axis) ^ `falloff`.
+    """Compute the factor by which a flash is weaker away from its axis: cosine ^ `falloff`, 1 on the axis.
 
-    `direction`: unit vector from the surface to the flash. The axis is the optical axis of the camera whose pose is
-    `to_world`.
+    The cosine is of the angle between the axis and the direction from the flash to the surface. `direction`: unit
+    vector from the surface to the flash. `to_world`: pose of the camera, whose optical axis is the axis of the flash.
+    `falloff`: exponent; 0: the flash is equal in all directions.
     """
     cosine = -dr.dot(direction, mi.Vector3f(to_world[0, 2], to_world[1, 2], to_world[2, 2]))
     return dr.power(dr.maximum(cosine, MIN_FLASH_COSINE), falloff)
 
 
 def toward(light: Light) -> np.ndarray:
-    """Return the unit direction (3,) toward a distant light."""
+    """Return the unit direction (3,) toward a directional light, opposite to that in which the light travels."""
     length = np.linalg.norm(light.vector)
     # What Mitsuba has read is of unit length, but for the rounding of float32.
     return -light.vector if abs(length - 1) < 1e-6 else -light.vector / length

@@ -19,9 +19,9 @@ LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
 
 @dataclass(frozen=True)
 class Photographs:
-    """Cameras and lights of all photographs of a scene, as Dr.Jit buffers, and which of them to render.
+    """Cameras and lights of all photographs of a scene, as Dr.Jit buffers, and which of the photographs to render.
 
-    In methods, `view` is an index into the selected photographs, one number per lane.
+    In methods, `view` (UInt32) is an index into the selected photographs, one for each lane.
     """
 
     views: Views  #: buffers of all photographs
@@ -36,10 +36,10 @@ class Photographs:
 
     @classmethod
     def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None) -> "Photographs":
-        """Collect cameras and lights of photographs. All are selected. `room` (BASIS, 3): room light.
+        """Collect cameras and lights of photographs. All are selected. `room` (BASIS, 3): room light; None: none.
 
-        `size` is the size of the first photograph. If photographs have several sizes, use `select` before you render.
-        Raises SceneError for unsupported lights.
+        `size` becomes that of the first photograph. If photographs have several sizes, select those of one size before
+        rendering. Raises SceneError if a light is invalid.
         """
         lights = Lights.of(shots)
         views = Views.of(shots, lights.positions(), lights.rgb())
@@ -53,7 +53,7 @@ class Photographs:
 
     @classmethod
     def attached(cls, sensor) -> "Photographs":
-        """Make the buffers of one photograph. They are attached to the parameters of the sensor and of its light."""
+        """Make the buffers of one `photograph` sensor. They carry gradients of the parameters of sensor and light."""
         m = sensor.to_world.matrix
         light = Lights.attached(sensor.light)
         views = Views(
@@ -64,10 +64,10 @@ class Photographs:
         return replace(cls.of([sensor.shot]), views=views)
 
     def select(self, index: Sequence[int] | np.ndarray, size: tuple[int, int], scale: int = 1) -> "Photographs":
-        """Return these photographs with another selection.
+        """Return a copy with another selection of photographs, and another size of the pictures.
 
-        `index`: the photographs to select, all of `size` (width, height) [px]. `scale`: how many times smaller they
-        will be rendered.
+        `index`: indices of the photographs to select, which all have `size` (width, height) [px]. `scale`: whole number
+        by which width and height are divided.
         """
         width, height = size
         views = self.views._replace(intrinsics=self.views.intrinsics / dr.opaque(mi.Float, scale))
@@ -76,7 +76,10 @@ class Photographs:
         )
 
     def with_views(self, views: Views) -> "Photographs":
-        """Return the photographs with other cameras and lights. `colocated` becomes False."""
+        """Return a copy with other cameras and lights. `views`: Dr.Jit buffers for all photographs.
+
+        In the copy, lights count as apart from their cameras (`colocated` is False), so that renderers compute shadows.
+        """
         return replace(self, views=views, colocated=False)
 
     @property
@@ -85,7 +88,10 @@ class Photographs:
         return Lights(self.views.places, self.finite, self.views.strengths)
 
     def in_units(self, unit: float) -> "Photographs":
-        """Return the photographs with all lengths in units of `unit` scene units. The pictures stay the same."""
+        """Return a copy in which all lengths have another unit. Intensities are changed so that pictures stay the same.
+
+        `unit`: the new unit [scene units].
+        """
         if unit == 1:
             return self
         views = self.views
@@ -99,7 +105,7 @@ class Photographs:
         return dr.width(self.index)
 
     def camera(self, view) -> Pinhole:
-        """Return the camera of photograph `view`."""
+        """Return the cameras of the photographs `view`, one for each lane."""
         k = dr.gather(mi.UInt32, self.index, view)
         rows = [dr.gather(mi.Vector4f, self.views.cameras, 3 * k + row) for row in range(3)]
         f = dr.gather(mi.Vector4f, self.views.intrinsics, k)
@@ -108,15 +114,21 @@ class Photographs:
         return Pinhole(to_world, mi.Point2f(f.x, f.y), mi.Point2f(f.z, f.w), distortion)
 
     def eye(self, view):
-        """Return the camera of photograph `view` as an eye; see `Edges`."""
+        """Return (position of the camera of photograph `view`, True), for each lane."""
         return mi.Vector3f(self.camera(view).position), mi.Bool(True)
 
     def source(self, view):
-        """Return the light of photograph `view` as an eye; see `Edges`."""
+        """Return where the light of photograph `view` is: (position, True), or (direction toward it, False).
+
+        The second is for directional lights.
+        """
         return self.lights.eye(dr.gather(mi.UInt32, self.index, view))
 
     def light(self, view, si):
-        """Sample the light of photograph `view` at the interactions `si`: (DirectionSample3f, radiance · d⁻²)."""
+        """Compute the light of photograph `view` that arrives at the interactions `si` if nothing is in its way.
+
+        Returns (DirectionSample3f toward the light, irradiance (Color3f) of a surface that faces the light).
+        """
         k = dr.gather(mi.UInt32, self.index, view)
         ds, radiance = self.lights.sample(k, si)
         if self.views.falloff is not None:
@@ -127,7 +139,10 @@ class Photographs:
 
     @property
     def casts_shadows(self) -> bool:
-        """Do the photographs' own lights cast shadows that the cameras can see?"""
+        """True if the photographs' own lights cast shadows that cameras can see.
+
+        False if all lights are at their cameras, or if all are black.
+        """
         return not (self.colocated or self.dark)
 
     @property
@@ -136,14 +151,18 @@ class Photographs:
         return [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
 
     def lighting(self, view):
-        """Return the function si ↦ `light(view, si)`. Returns None if the photographs have no lights of their own."""
+        """Return a function of surface interactions that computes the own light of photograph `view` there.
+
+        The function returns (DirectionSample3f toward the light, irradiance (Color3f) of a surface that faces the
+        light). Returns None instead of a function if all lights are black.
+        """
         return None if self.dark else lambda si: self.light(view, si)
 
     def room_radiance(self, scene, view):
-        """Return a function of surface interactions that computes the room light which they reflect to the viewer.
+        """Return a function from surface interactions to the room light (Color3f) that they reflect to the viewer.
 
-        The light is without occlusion, and attached. Returns None if there is no room light. `view`: photograph of each
-        lane; it matters if the room turns with the camera.
+        It assumes that nothing blocks the room light. Its result carries gradients. Returns None if there is no room
+        light. `view`: photograph of each lane, for room light that is fixed to the camera.
         """
         which = self.harmonics
         if not which:
@@ -157,7 +176,7 @@ class Photographs:
         return radiance
 
     def irradiance(self, point: np.ndarray) -> np.ndarray:
-        """Compute the irradiance (N, 3) by each photograph's light at `point` (3,), on a surface that faces the light.
+        """Compute the RGB irradiance (N, 3) by each photograph's light at `point` (3,), on a surface that faces it.
 
         If the photographs have no lights of their own, it is the mean irradiance by the room light.
         """
@@ -168,7 +187,7 @@ class Photographs:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(number, height [px], width [px]) of the selected photographs."""
+        """(number of selected photographs, height [px], width [px])."""
         return len(self), self.size[1], self.size[0]
 
     @property
@@ -177,30 +196,34 @@ class Photographs:
         return math.prod(self.shape)
 
     def first_lane(self, spp: int, first: int = 0):
-        """Return the number of the first lane of pixel `first` of the selection, with `spp` lanes per pixel.
+        """Return the number of the first ray of a pixel, for random numbers. It counts the rays of all photographs.
 
-        Lanes are numbered through all photographs, also those that are rendered elsewhere; see `before`.
+        `spp`: rays per pixel. `first`: number of the pixel, counted through the selected photographs. Photographs that
+        are rendered elsewhere before these are counted, too, so that random numbers do not depend on who renders them.
         """
         return dr.opaque(mi.UInt32, (self.before * self.size[0] * self.size[1] + first) * spp % 2**32)
 
     def chunks(self, spp: int) -> Iterator[tuple[int, int]]:
-        """Split all pixels into ranges of at most `LANES` rays, with `spp` rays per pixel. Yields (first, last + 1)."""
+        """Split all pixels into ranges of at most `LANES` rays, so that memory is bounded. Yields (first, last + 1).
+
+        `spp`: rays per pixel. Pixels are numbered through all selected photographs.
+        """
         step = max(1, LANES // spp)
         return ((first, min(first + step, self.pixels)) for first in range(0, self.pixels, step))
 
 
 def pixel_position(photographs: Photographs, pixel):
-    """Return (photograph, column, row) of a pixel. `pixel`: its number, counted through all selected photographs."""
+    """Return (photograph, column, row) of pixels. `pixel` (UInt32): numbers through all selected photographs."""
     width, height = photographs.size
     view, pixel = pixel // (width * height), pixel % (width * height)
     return view, mi.Float(pixel % width), mi.Float(pixel // width)
 
 
 def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int, int] | None = None):
-    """Generate `spp` stratified camera rays per pixel. Returns (rays, photograph of each lane).
+    """Make `spp` stratified random camera rays per pixel. Returns (Ray3f, index of the photograph of each ray).
 
-    The rays of a pixel are in consecutive lanes. `pixels`: range of pixels (first, last + 1); default: all. The rays of
-    a pixel do not depend on the range.
+    Consecutive rays belong to the same pixel. `pixels`: range of pixels (first, last + 1), numbered through all
+    selected photographs; None: all. The rays of a pixel do not depend on the range.
     """
     first, last = pixels or (0, photographs.pixels)
     local = dr.arange(mi.UInt32, (last - first) * spp)
@@ -219,9 +242,9 @@ def pixel_rays(photographs: Photographs, spp: int, seed: int, pixels: tuple[int,
 
 
 def center_rays(photographs: Photographs, pixels: tuple[int, int] | None = None):
-    """Generate one ray through each pixel centre. Returns (rays, photograph of each lane).
+    """Make one camera ray through each pixel centre. Returns (Ray3f, index of the photograph of each ray).
 
-    `pixels`: see `pixel_rays`.
+    `pixels`: range of pixels (first, last + 1), numbered through all selected photographs; None: all.
     """
     first, last = pixels or (0, photographs.pixels)
     pixel = dr.arange(mi.UInt32, last - first) + dr.opaque(mi.UInt32, first)

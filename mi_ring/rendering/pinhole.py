@@ -1,4 +1,4 @@
-"""Pinhole cameras with radial distortion in Dr.Jit: they convert pixels to rays and points to pixels."""
+"""Pinhole cameras with radial distortion in Dr.Jit: convert pixels to rays, and points to pixels."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ OUTSIDE = 1e6  #: factor of picture coordinates that puts a point outside of eve
 
 
 class Pinhole(NamedTuple):
-    """A camera in Dr.Jit, or one camera per lane. It has the parameters of `mi_ring.geometry.camera.Camera`."""
+    """A pinhole camera with radial distortion in Dr.Jit: one camera, or one for each lane."""
 
     to_world: Any  #: Matrix4f camera-to-world, Mitsuba's camera axes: x left, y up, z forward
     focal: Any  #: Point2f, focal lengths (fx, fy) [px]
@@ -38,14 +38,15 @@ class Pinhole(NamedTuple):
         return self.position, dr.normalize(direction)
 
     def local(self, vector):
-        """Convert a direction from world to camera coordinates, by the inverse of the 3 × 3 part of `to_world`."""
+        """Convert a direction from world to camera coordinates. The result carries gradients of `to_world`."""
         # Not by the transpose, though it is a rotation: the gradient with respect to each entry would be wrong.
         return dr.rcp(mi.Matrix3f([[self.to_world[i, j] for j in range(3)] for i in range(3)])) @ vector
 
     def project(self, point):
-        """Project a point in the world: the inverse of `ray`.
+        """Project a point in the world. Returns (pixel coordinates [px], depth along the optical axis [scene units]).
 
-        Returns (pixel coordinates [px], depth along the optical axis [scene units]).
+        The depth is negative for a point behind the camera. A point that the lens cannot show is far outside of the
+        picture.
         """
         x, y, z = self.local(point - self.position)
         x, y = x / z, y / z
@@ -57,9 +58,9 @@ class Pinhole(NamedTuple):
         return mi.Point2f(self.centre.x - self.focal.x * x, self.centre.y - self.focal.y * y), z
 
     def project_tangent(self, point, tangent):
-        """Compute how `point` moves in the picture [px] if it moves by `tangent` in the world.
+        """Compute the motion in the picture, Vector2f [px], of a point in the world that moves by the vector `tangent`.
 
-        This is the derivative of `project`.
+        It is the first-order motion: the derivative of the projection at `point`, times `tangent`.
         """
         x, y, z = self.local(point - self.position)
         dx, dy, dz = self.local(tangent)

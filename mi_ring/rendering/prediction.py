@@ -24,17 +24,18 @@ def render(
     surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
     seed: int = 0, shadows: bool = True, views: Views | None = None, lamps: Sequence[Tensor] = (),
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Render photographs of the surface, each under its own light. Returns differentiable tensors.
+    """Render N photographs of the surface, each under its own light. Returns differentiable tensors.
 
     `vertices` (V, 3) [scene units]. `attributes`: the mesh attributes that the BSDF reads, (V, 3) or (V,), by name.
     `photographs`: which photographs to render, and at what size. `spp`: stratified samples per pixel. `seed`: the same
     seed gives the same samples. `shadows`: the photographs' own lights cast shadows. `views`: other cameras and lights
-    of all P photographs, as tensors. `lamps`: other places and strengths, both (L, 3), of the scene's L lamps; see
-    `Surface.relight`.
+    of all photographs, as tensors; None: those in `photographs`. `lamps`: empty, or (places, strengths) of the scene's
+    L lamps, both (L, 3): positions or unit directions toward distant lamps; intensities, or irradiances of distant
+    lamps.
 
-    Returns (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). Their gradients with respect to all tensors
-    contain shading, outlines and edges of cast shadows. There can be one backward pass, before the surface is written
-    again; otherwise the backward pass raises RuntimeError. Raises the ValueError of `Surface.parameters`.
+    Returns (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). Gradients with respect to all tensors contain
+    shading, outlines and edges of cast shadows. Writes the mesh of `surface`. Call backward at most once, before the
+    surface is written again; otherwise it raises RuntimeError. Raises ValueError if a tensor does not fit the mesh.
     """
     parameters = surface.parameters(vertices, attributes)
     others = [*(views or ()), *lamps]
@@ -59,10 +60,10 @@ def render(
 
 
 def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Tensor:
-    """Replace infinite and NaN entries of a gradient (V, 3) by 0 at the vertices of triangles without area.
+    """Replace infinite and NaN entries of a gradient (V, 3) by 0 at vertices of triangles without area.
 
     Mitsuba's vertex normals cause such entries. Infinite and NaN entries at other vertices stay. `vertices` (V, 3),
-    `faces` (F, 3): the mesh.
+    `faces` (F, 3): the mesh. Returns the corrected gradient.
     """
     if gradient.isfinite().all():
         return gradient
@@ -77,7 +78,10 @@ def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Te
 
 
 def with_views(photographs: Photographs, views: Views) -> Photographs:
-    """Return the photographs with other cameras and lights. `views`: tensors; their gradients are lost."""
+    """Return a copy of the photographs with other cameras and lights. `views`: tensors for all photographs.
+
+    The copy carries no gradients.
+    """
     return photographs.with_views(Views(*map(to_drjit, views)))
 
 
@@ -85,15 +89,16 @@ def draw(
     surface: Surface, photographs: Photographs, spp: int = 16, seed: int = 0, shadows: bool = True,
     indirect: bool = False, paths: int = 32, occlusion: bool = True,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Render photographs of the surface as it was last written, without gradients.
+    """Render N photographs of the surface as it was last written, without gradients.
 
-    Arguments and result: as for `render`; the tensors are on the CPU. `indirect`: add interreflection, rendered with
-    `paths` paths per pixel in a picture that is at most 128 pixels wide. The pictures always contain the light of
-    `photographs.room`. `occlusion`: the surface blocks a part of this light; otherwise it blocks none.
+    Returns CPU tensors: (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). `photographs`: which photographs
+    to render, and at what size. `spp`: samples per pixel. `shadows`: the photographs' own lights cast shadows.
+    `indirect`: add interreflection, rendered with `paths` paths per pixel in a picture that is at most 128 pixels wide.
+    The light of the room in `photographs` is always added. `occlusion`: True: the surface blocks a part of the room
+    light; False: it blocks none of it, which is faster.
 
-    However many pixels and samples there are, this needs about a gigabyte of memory
-    (`mi_ring.rendering.photographs.LANES` rays at once) besides the pictures. `indirect` or a room need about 100 MB
-    more for each photograph.
+    However many pixels and samples there are, this needs about a gigabyte of memory besides the pictures. `indirect` or
+    room light need about 100 MB more for each photograph.
     """
     own, parts = photographs.in_units(surface.unit), []
     for pixels in photographs.chunks(spp):
@@ -113,10 +118,10 @@ def draw(
 def maps(
     surface: Surface, photographs: Photographs, parameters: Sequence[Parameter] = COOK_TORRANCE
 ) -> dict[str, np.ndarray]:
-    """Render normals and BSDF parameters at the centres of pixels, for the surface as it was last written.
+    """Render normals and BSDF parameters at pixel centres of N photographs, for the surface as it was last written.
 
-    Returns arrays by name: `normal` (N, H, W, 3) in world space, and each of the `parameters` (N, H, W, 3) or
-    (N, H, W). Pixels without a surface are 0.
+    Returns NumPy arrays by name: `normal` (N, H, W, 3) in world space, and each of `parameters`, (N, H, W, 3) or (N, H,
+    W). Pixels without a surface are 0.
     """
     own, parts = photographs.in_units(surface.unit), []
     attributes = {f"vertex_{p.name}": p.channels for p in parameters}

@@ -1,7 +1,7 @@
 """The light of a room as spherical harmonics, in the axes of the world and in the axes of the camera.
 
-A room is an array (BASIS, 3): the RGB radiance of each harmonic. The first PER_FRAME harmonics are in the axes of the
-world, the others in those of the camera. The camera's first harmonic is left out: it is the same as the world's.
+Room light is an array (BASIS, 3): the RGB coefficient of each harmonic of the radiance. The first PER_FRAME harmonics
+are in the axes of the world, the others in the axes of the camera, without degree 0, which is the same in both.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -22,17 +22,20 @@ FRAMES = {"world": [*range(PER_FRAME)], "camera": [0, *range(PER_FRAME, BASIS)]}
 
 
 def harmonics_up_to(order: int, frames: Iterable[str]) -> list[int]:
-    """List the indices of the harmonics up to degree `order` in the axes `frames`: "world", "camera" or both."""
+    """List the indices of the harmonics up to degree `order`, sorted.
+
+    `frames`: the axes whose harmonics are listed: "world", "camera" or both.
+    """
     return sorted({k for frame in frames for k in FRAMES[frame][: (order + 1) ** 2]})
 
 
 def degree(k: int) -> int:
-    """Return the degree l of the harmonic with index `k`."""
+    """Return the degree l of the harmonic with index `k`, 0 to BASIS − 1."""
     return int((k if k < PER_FRAME else k - PER_FRAME + 1) ** 0.5)
 
 
 def room_of(scene) -> np.ndarray | None:
-    """Sum the light of all `room` emitters of a scene. Returns harmonics (BASIS, 3); None if there are no emitters."""
+    """Return the sum of all `room` emitters of a scene as harmonics (BASIS, 3); None if there is no such emitter."""
     rooms = [emitter for emitter in scene.emitters() if is_room(emitter)]
     total = np.zeros((BASIS, 3))
     for room in rooms:
@@ -42,7 +45,7 @@ def room_of(scene) -> np.ndarray | None:
 
 
 def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
-    """Make a scene without `envmap` and `constant` emitters. Returns (new scene, harmonics (BASIS, 3) of their light).
+    """Make a scene without `envmap` and `constant` emitters. Returns (new scene, their light as harmonics (BASIS, 3)).
 
     If the scene has no such emitters, returns (`scene`, None).
     """
@@ -54,7 +57,10 @@ def without_environment(scene) -> tuple[mi.Scene, np.ndarray | None]:
 
 
 def harmonics_of(environment) -> np.ndarray:
-    """Project the light of an infinitely distant emitter to spherical harmonics (BASIS, 3)."""
+    """Project the radiance of an `envmap` or `constant` emitter onto spherical harmonics. Returns (BASIS, 3).
+
+    The harmonics are in the axes of the world.
+    """
     directions, angles = envmap_directions(FINE_ROWS)
     toward, si = mi.Vector3f(*directions.T), dr.zeros(mi.SurfaceInteraction3f, len(angles))
     si.wi = -toward
@@ -65,16 +71,19 @@ def harmonics_of(environment) -> np.ndarray:
 
 
 def world_harmonics(directions: np.ndarray, order: int = MAX_ORDER) -> np.ndarray:
-    """Evaluate spherical harmonics up to degree `order` in unit directions (n, 3). Returns ((order + 1)², n)."""
+    """Evaluate spherical harmonics up to degree `order` in unit directions (n, 3). Returns ((order + 1)², n).
+
+    The harmonics have the axes of the directions.
+    """
     values = dr.sh_eval(mi.Vector3f(*directions.T.astype(np.float32)), order)
     return np.stack([np.asarray(value + dr.zeros(mi.Float, len(directions))) for value in values])
 
 
 def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the directions and sizes of the pixels of an environment map with `rows` rows and 2 `rows` columns.
+    """Compute directions and solid angles of the pixels of an environment map with `rows` rows and 2 `rows` columns.
 
-    Returns (unit directions (2 rows², 3), solid angles (2 rows²,)). Latitude and longitude are as in Mitsuba's
-    `envmap`: y is up, and -z is at the left and right borders.
+    Returns (unit directions (2 rows², 3), solid angles (2 rows²,) [sr]), row by row. Latitude and longitude are as in
+    Mitsuba's `envmap`: y is up, and -z is at the left and right borders.
     """
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
     theta, phi = np.pi * v.ravel(), 2 * np.pi * u.ravel()
@@ -83,14 +92,17 @@ def envmap_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def frames_of(scene) -> set[str]:
-    """Return the set of coordinate frames of a scene's `room` emitters; {"world"} if there are no such emitters."""
+    """Return the axes in which a scene's `room` emitters are given: a set of "world" and "camera".
+
+    If the scene has no such emitters, returns {"world"}.
+    """
     return {emitter.frame for emitter in scene.emitters() if is_room(emitter)} or {"world"}
 
 
 def evaluated_harmonics(direction, to_world, which: Sequence[int]) -> list:
-    """Evaluate the harmonics with indices `which` in a `direction` in the world. Returns a list of Floats.
+    """Evaluate the harmonics with indices `which` in directions (Vector3f in the world). Returns a Float for each.
 
-    `to_world`: pose of the camera, for the harmonics in its axes.
+    `to_world`: pose of the camera, for harmonics in the axes of the camera.
     """
     order = max(map(degree, which))
     world = dr.sh_eval(direction, order) if min(which) < PER_FRAME else []
@@ -104,17 +116,21 @@ def to_camera_axes(direction, to_world):
 
 
 def bsdfs_with_lobes(scene) -> list:
-    """List the BSDFs of a scene that have a method `lobes`. Each BSDF is listed once."""
+    """List the BSDFs of a scene that can reflect spherical harmonics in closed form (they have a method `lobes`).
+
+    A BSDF that several shapes use is listed once.
+    """
     found = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in scene.shapes()) if hasattr(bsdf, "lobes")}
     return list(found.values())
 
 
 def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], active=True) -> list:
-    """Compute the radiance that the surface interactions `si` reflect if a harmonic is the light, without occlusion.
+    """Compute the radiance that surface interactions reflect to the viewer in a room whose radiance is a harmonic.
 
-    Returns one Color3f for each harmonic in `which`. They are attached. A lobe of a BSDF multiplies each degree of the
-    harmonics about its direction by a factor, as in "A Signal-Processing Framework for Inverse Rendering" (Ramamoorthi
-    and Hanrahan 2001). A BSDF that is not in `bsdfs` reflects nothing. `to_world`: pose of the camera.
+    Nothing blocks this light. Returns a Color3f for each index of a harmonic in `which`; they carry gradients. `bsdfs`:
+    BSDFs with a method `lobes`; all other BSDFs reflect nothing. `to_world`: pose of the camera. Each lobe of a BSDF
+    multiplies each degree of the harmonics by a factor, as in "A Signal-Processing Framework for Inverse Rendering"
+    (Ramamoorthi and Hanrahan 2001).
     """
     total = [mi.Color3f(0) for _ in which]
     for bsdf in bsdfs:
@@ -126,10 +142,10 @@ def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], a
 
 
 def room_envmap(room: np.ndarray, to_world: np.ndarray, rows: int = ENVMAP_ROWS) -> np.ndarray:
-    """Convert room light (BASIS, 3) to an environment map (rows, 2 rows, 3) for Mitsuba's `envmap`.
+    """Convert room light (BASIS, 3) to an environment map (rows, 2 rows, 3), with the axes of Mitsuba's `envmap`.
 
-    `to_world`: pose of the camera, for the harmonics in its axes. The radiance may be negative, because there are few
-    harmonics.
+    `to_world`: pose of the camera, for harmonics in the axes of the camera. The radiance may be negative in some
+    directions, because there are few harmonics.
     """
     directions, _ = envmap_directions(rows)
     which, values = np.flatnonzero(room.any(1)).tolist() or [0], np.zeros((len(directions), 3))

@@ -1,4 +1,4 @@
-"""The surface that is rendered: the `shapenet` shape of a scene, to which torch tensors are written."""
+"""The surface that is rendered: the `shapenet` shape of a scene, to whose mesh torch tensors are written."""
 
 import math
 
@@ -21,11 +21,11 @@ class Surface:
 
     `scene`, `shape`: a scene and its `shapenet` shape. `ring`: a fitted object. If it is given, the surface is a new
     shape with the BSDF of this object, in a new scene. The new scene shares all other objects with `scene`, which does
-    not change. If `ring` is None, the surface is `shape` itself. Other shapes and top-level emitters are part of every
-    picture. A `table` is not visible: it only reflects light onto the other shapes.
+    not change. If `ring` is None, the surface is `shape` itself. Other shapes and emitters of the scene are part of
+    every picture. A `table` is invisible: it only reflects light onto the other shapes.
 
-    `unit` is the length of a unit of the new scene [scene units]. It is 1, except for a tiny or enormous object that is
-    alone in its scene: float32 could not represent its areas. `in_scene_units`: `unit` is always 1.
+    `unit` is the length unit of the new scene [scene units]. It is 1, except for a tiny or enormous object that is
+    alone in its scene, because float32 could not represent its areas. `in_scene_units`: True: `unit` is always 1.
     """
 
     def __init__(
@@ -49,16 +49,16 @@ class Surface:
         self.written = 0  #: number of times that vertices were written
 
     def set_faces(self, faces: np.ndarray) -> None:
-        """Replace the triangles (F, 3). Vertices and attributes must be written before the next picture."""
+        """Set other triangles (F, 3). Vertices and attributes must be written again before the next rendering."""
         if faces is not self.faces:
             self.faces, self.faces_changed = faces, True
 
     def parameters(self, vertices: Tensor, attributes: dict[str, Tensor]) -> dict[str, Tensor]:
         """Convert tensors to the parameters of the mesh. Writes nothing.
 
-        `vertices` (V, 3) [scene units]. `attributes`: (V, 3) or (V,) by name. Returns tensors by Mitsuba's name of the
-        parameter: first the vertices, in units of `unit`, then the attributes. Raises ValueError if the triangles need
-        another number of vertices, or if an attribute has another size.
+        `vertices` (V, 3) [scene units]. `attributes`: (V, 3) or (V,) by name. Returns tensors with Mitsuba's names as
+        keys: first the vertices, in units of `unit`, then the attributes. Raises ValueError if V is not the number of
+        vertices that the triangles need, or if an attribute has another size.
         """
         needed = int(self.faces.max()) + 1
         if vertices.shape != (needed, 3):
@@ -72,16 +72,17 @@ class Surface:
         return {POSITIONS: vertices / self.unit} | {f"vertex_{name}": value for name, value in attributes.items()}
 
     def write(self, vertices: Tensor, attributes: dict[str, Tensor]) -> None:
-        """Write vertices (V, 3) [scene units] and attributes (V, 3) or (V,) to the mesh, without gradients.
+        """Write vertices and attributes to the mesh, without gradients.
 
-        Raises the ValueError of `parameters`.
+        `vertices` (V, 3) [scene units]. `attributes`: (V, 3) or (V,) by name. Raises ValueError if V is not the number
+        of vertices that the triangles need, or if an attribute has another size.
         """
         self.write_arrays({name: to_drjit(t) for name, t in self.parameters(vertices, attributes).items()})
 
     def write_arrays(self, arrays: dict[str, mi.Float]) -> None:
-        """Write parameters of the mesh. `arrays`: Dr.Jit Floats by the names of `parameters`; they may be attached.
+        """Write parameters of the mesh. `arrays`: flat Dr.Jit Floats by Mitsuba's names; they may carry gradients.
 
-        If the number of vertices changes, an attribute that is not written becomes 0; the BSDF must not read it.
+        If the number of vertices changes, an attribute that is not in `arrays` becomes 0. The BSDF must not read it.
         """
         if self.faces_changed:
             self.params[self.prefix + FACES] = mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel())
@@ -92,10 +93,11 @@ class Surface:
         self.written += 1
 
     def relight(self, places: mi.Float, strengths: mi.Float) -> None:
-        """Change the L lamps in this surface's scene. The scene that was given to the constructor does not change.
+        """Change the L lamps in the scene of this surface. The scene that was given to the constructor does not change.
 
-        `places` (3 L numbers): positions [scene units], or unit directions toward distant lamps. `strengths` (3 L
-        numbers): intensities [W/sr], or irradiances [W/m²] of distant lamps. Both may be attached.
+        Lamps are point and directional emitters that do not belong to a shape. `places` (3 L numbers): positions [scene
+        units], or unit directions toward directional lights. `strengths` (3 L numbers): intensities [W/sr], or
+        irradiances [W/m²] of directional lights. Both may carry gradients.
         """
         if not self.owns_lamps:
             self.scene, self.owns_lamps = with_lamps(self.scene, lamp_lights(self.scene)), True
@@ -103,9 +105,10 @@ class Surface:
         move_lamps(self.scene, places, strengths)
 
     def show(self, ring: RenderedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
-        """Evaluate a fitted object at the domain points `s` (V, 3), and write the resulting surface and material.
+        """Evaluate a fitted object at points `s` (V, 3) of its domain, and write surface and material to the mesh.
 
-        `faces` (F, 3): triangles of the points. `time`: of the deformation, 0 to 1.
+        `faces` (F, 3): triangles of the points. `time`: state of the deformation, from 0 (start surface) to 1 (fitted
+        object).
         """
         with torch.no_grad():
             self.set_faces(faces)
@@ -113,6 +116,9 @@ class Surface:
 
 
 def unit_for(radius: float) -> float:
-    """Choose the unit of length [scene units] in which an object of this radius is rendered: 1, or a power of 2."""
+    """Choose the length unit [scene units] in which an object of this `radius` is rendered.
+
+    It is 1 for usual radii. For tiny and enormous objects, it is the power of 2 next to the radius.
+    """
     least, largest = RADII_IN_SCENE_UNITS
     return 1.0 if least <= radius <= largest else 2.0 ** round(math.log2(radius))

@@ -1,4 +1,4 @@
-"""Cameras and lights of many photographs as arrays. A fit refines them, and the renderer reads them."""
+"""Cameras and lights of many photographs as arrays, which a fit refines and the renderer reads."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from mi_ring.scene.shot import Shot
 
 
 class Views(NamedTuple):
-    """Cameras and lights of P photographs, as numpy arrays, torch tensors or flat Dr.Jit buffers."""
+    """Cameras and lights of P photographs, all as NumPy arrays, as torch tensors, or as flat Dr.Jit buffers."""
 
     cameras: Any  #: (P, 3, 4) camera-to-world
     intrinsics: Any  #: (P, 4) fx, fy, cx, cy [px]
@@ -22,7 +22,11 @@ class Views(NamedTuple):
 
     @classmethod
     def of(cls, shots: Sequence[Shot], places: np.ndarray, strengths: np.ndarray) -> "Views":
-        """Collect the cameras of P photographs as numpy arrays. `places`, `strengths` (P, 3): the lights."""
+        """Collect the cameras of P photographs as NumPy arrays.
+
+        `places` (P, 3): positions of the photographs' lights [scene units], or unit directions toward distant lights.
+        `strengths` (P, 3): RGB intensities, or irradiances of distant lights.
+        """
         cameras = [shot.camera for shot in shots]
         return cls(
             np.stack([camera.to_world[:3] for camera in cameras]),
@@ -31,16 +35,16 @@ class Views(NamedTuple):
         )  # fmt: skip
 
     def to(self, device: Any) -> "Views":
-        """Return these views on another torch device."""
+        """Return the tensors on another torch device."""
         return Views(*(tensor.to(device) for tensor in self))
 
     def buffers(self) -> "Views":
-        """Return these views, which must be numpy arrays, as Dr.Jit buffers."""
+        """Convert NumPy arrays to flat Dr.Jit buffers of float32. `falloff` and `distortion` become None if all 0."""
         buffers = {name: mi.Float(array.astype(np.float32).ravel()) for name, array in self._asdict().items()}
         return Views(**buffers | {name: None for name in ("falloff", "distortion") if not getattr(self, name).any()})
 
     def camera(self, k: int, size: tuple[int, int]) -> Camera:
-        """Return the camera of photograph `k`. `size`: (width, height) [px]. For numpy arrays only."""
+        """Return the camera of photograph `k`. `size`: (width, height) of the picture [px]. For NumPy arrays only."""
         lens = self.intrinsics[k]
         pose = np.vstack([self.cameras[k], [0, 0, 0, 1]])
         return Camera(pose, lens[:2], lens[2:], size, float(self.distortion[k]))

@@ -1,4 +1,4 @@
-"""Makes scenes from parts of other scenes: with other lamps, with another object, or without tables."""
+"""Makes scenes from the objects of other scenes: with other lamps, with another object, or without tables."""
 
 from collections.abc import Iterable
 from typing import Any, Protocol
@@ -15,10 +15,10 @@ MAX_EXTENT = 4.0  #: radius of a ball that contains the object during a fit [rad
 
 
 class RenderedObject(Protocol):
-    """The part of `FittedObject` that renderers need. Tensors are torch's.
+    """What a renderer needs of a reconstructed object: its surface and its material. Tensors are torch's.
 
-    The package `mi_ring.scene` must not import `mi_ring.objects`. So its functions name this protocol instead of
-    `FittedObject`.
+    `mi_ring.objects.FittedObject` is such an object. This protocol exists because this package must not import
+    `mi_ring.objects`.
     """
 
     center: Any  #: (3,) tensor of the normalising sphere [scene units]
@@ -27,7 +27,10 @@ class RenderedObject(Protocol):
     brdf_net: Any  #: its `bsdf_parameters` have the attributes that the BSDF reads
 
     def surface(self, s: Any, time: float = 1.0) -> Any:
-        """Compute the surface points (V, 3) of domain points `s` (V, 3). `time`: of the deformation, 0 to 1."""
+        """Compute the surface points (V, 3) [scene units] for points `s` (V, 3) of the domain, the start surface.
+
+        `time`: state of the deformation, from 0 (start surface) to 1 (finished object).
+        """
         ...
 
     def __call__(self, s: Any, time: float = 1.0) -> tuple[Any, dict[str, Any]]:
@@ -47,29 +50,39 @@ def lamps_of(scene) -> list:
 
 
 def lamp_lights(scene) -> list[Light]:
-    """Convert the lamps of a scene (see `lamps_of`) to lights, in the same order."""
+    """Return the lamps of a scene as lights: its point and directional emitters that do not belong to a shape.
+
+    Their order is that of the scene.
+    """
     return [light_of(lamp) for lamp in lamps_of(scene)]
 
 
 def with_lamps(scene, lamps: Iterable[Light]) -> mi.Scene:
-    """Make a scene in which `lamps` replace the lamps of `scene`. All other objects are shared with `scene`."""
+    """Make a scene in which `lamps` replace the point and directional emitters of `scene`.
+
+    Emitters that belong to shapes stay. All other objects are shared with `scene`.
+    """
     before = lamps_of(scene)
     others = [emitter for emitter in top_level_emitters(scene) if emitter not in before]
     return changed_scene(scene, emitters=[*others, *map(emitter_of, lamps)])
 
 
 def move_lamps(scene, places, strengths) -> None:
-    """Change the L lamps of a scene from `with_lamps`, in place.
+    """Change the L point and directional emitters of a scene, in place. They must have RGB intensities or irradiances.
 
-    `places` (3 L numbers): positions [scene units], or unit directions toward distant lamps. `strengths` (3 L numbers):
-    intensities, or irradiances of distant lamps. Both are Dr.Jit Floats and may be attached.
+    `places` (3 L numbers): positions [scene units] of point lights, unit directions toward directional lights.
+    `strengths` (3 L numbers): intensities of point lights, irradiances of directional lights. Both are Dr.Jit Floats in
+    the order of the scene's lamps, and may carry gradients.
     """
     for k, lamp in enumerate(lamps_of(scene)):
         move_lamp(lamp, dr.gather(mi.Vector3f, places, k), dr.gather(mi.Color3f, strengths, k))
 
 
 def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
-    """Make a scene of these Mitsuba objects. The objects keep their ids, and meshes are not merged."""
+    """Make a Mitsuba scene of shapes, emitters, sensors and an integrator. Returns the scene.
+
+    These objects keep their ids. Meshes are not merged. `emitters`: those that do not belong to a shape.
+    """
     parts = [*shapes, *emitters, *sensors, *([integrator] if integrator else [])]
     ids = [part.id() for part in parts]
     everything = {"type": "scene"} | {f"part{k}": part for k, part in enumerate(parts)}
@@ -80,9 +93,10 @@ def assembled(shapes, emitters=(), sensors=(), integrator=None) -> mi.Scene:
 
 
 def changed_scene(scene, shapes=None, emitters=None) -> mi.Scene:
-    """Make a scene with these shapes and these top-level emitters; None stands for those of `scene`.
+    """Make a scene with other shapes or other emitters. It shares all other objects with `scene`.
 
-    The new scene shares all other objects with `scene`.
+    `shapes`: replace all shapes; None: the shapes stay. `emitters`: replace all emitters that do not belong to a shape;
+    None: these emitters stay.
     """
     shapes = scene.shapes() if shapes is None else shapes
     emitters = top_level_emitters(scene) if emitters is None else emitters
@@ -94,9 +108,10 @@ def with_fitted_shape(
 ) -> tuple[mi.Scene, mi.Mesh]:
     """Make a scene in which a new shape replaces `shape`. Returns (new scene, new shape).
 
-    The new shape has the BSDF of `ring` and the mesh attributes that this BSDF reads, but not yet the surface. It is a
-    ball that contains the object: when a scene is assembled, Mitsuba places distant emitters outside of the scene's
-    bounding sphere. `unit`: length of the unit of the new scene [scene units].
+    The new shape has the BSDF of `ring` and the mesh attributes that this BSDF reads, with arbitrary values. Its
+    vertices are not those of the object yet. They lie on a sphere around the object, because Mitsuba places distant
+    emitters outside of the scene's bounding sphere when the scene is made. `unit`: length unit of the new scene [units
+    of `ring`].
     """
     new = mi.load_dict({
         "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
@@ -118,9 +133,9 @@ def with_fitted_shape(
 
 
 def split_tables(scene) -> tuple[mi.Scene, mi.Scene | None]:
-    """Split a scene. Returns (scene without its `table` shapes, scene of these shapes only).
+    """Split a scene into its `table` shapes and all else. Returns (scene without tables, scene with only the tables).
 
-    If there is no `table`, it returns (`scene`, None).
+    If there is no `table`, returns (`scene`, None).
     """
     tables = [shape for shape in scene.shapes() if is_table(shape)]
     if not tables:
@@ -129,10 +144,10 @@ def split_tables(scene) -> tuple[mi.Scene, mi.Scene | None]:
 
 
 def has_table(scene) -> bool:
-    """Test whether a scene has a `table` shape."""
+    """Return True if a scene has a `table` shape."""
     return any(is_table(shape) for shape in scene.shapes())
 
 
 def is_table(shape) -> bool:
-    """Test whether a shape is a `table`. This works for the classes of all variants of Mitsuba."""
+    """Return True if a shape is a `table`, in any variant of Mitsuba."""
     return getattr(shape, "of_tables", False)

@@ -1,4 +1,4 @@
-"""Point and directional lights, as numbers and as Mitsuba emitters, and tests for kinds of emitters."""
+"""Point and directional lights, as numbers and as Mitsuba emitters. Also tests the kinds of emitters."""
 
 from typing import Literal, NamedTuple
 
@@ -20,7 +20,10 @@ class Light(NamedTuple):
 
 
 def usable_light(light: Light | None, what: str) -> Light | None:
-    """Check a light and round its numbers to float32; None stays None. Raises InputError; `what` begins the message."""
+    """Check a light that a user gave. Returns it with numbers rounded to float32. None stays None.
+
+    `what`: beginning of the message. Raises InputError if the light cannot be used.
+    """
     if light is None:
         return None
     if not isinstance(light, Light) or light.kind not in ("point", "directional"):
@@ -35,10 +38,10 @@ def usable_light(light: Light | None, what: str) -> Light | None:
 
 
 def position_of(emitter):
-    """Find where an emitter is. Returns (position, True), or (unit direction toward it, False) if it is distant.
+    """Find where a Mitsuba emitter is. Its position or direction keeps the gradients of the emitter's parameters.
 
-    The vectors are attached to the emitter's parameters. Returns None for other emitters, such as area lights and
-    environment maps.
+    Returns (position, True) for a point light or a spot light, (unit direction toward the light, False) for a
+    directional light, and None for other emitters, such as area lights and environment maps.
     """
     params = mi.traverse(emitter)
     match emitter.class_name():
@@ -53,14 +56,14 @@ def position_of(emitter):
 
 
 def light_of(emitter) -> Light:
-    """Convert a point or directional emitter of Mitsuba to a light, which has plain numbers."""
+    """Convert a point or directional emitter of Mitsuba to NumPy values, without gradients."""
     where, finite = position_of(emitter)
     vector, rgb = (np.array(dr.detach(part), float).ravel() for part in (where, strength_of(emitter)))
     return Light("point", vector, rgb) if finite else Light("directional", -vector, rgb)
 
 
 def emitter_of(light: Light) -> mi.Emitter:
-    """Make a Mitsuba emitter from a light."""
+    """Make a Mitsuba emitter, point or directional, from a light."""
     vector = light.vector.tolist()
     where = {"position": vector} if light.kind == "point" else {"direction": vector}
     strength = "intensity" if light.kind == "point" else "irradiance"
@@ -68,10 +71,10 @@ def emitter_of(light: Light) -> mi.Emitter:
 
 
 def move_lamp(emitter, place, strength) -> None:
-    """Change an emitter from `emitter_of`, in place. The new values may be attached.
+    """Change a point or directional emitter in place. The new values may carry gradients.
 
-    `place`: position of a point light, or unit direction toward a directional light. `strength`: RGB intensity, or
-    irradiance of a directional light.
+    `place`: position of a point light, or unit direction toward a directional light. `strength`: RGB intensity of a
+    point light, or RGB irradiance of a directional light. The emitter must have RGB values, not spectra.
     """
     params = mi.traverse(emitter)
     if emitter.class_name() == "PointLight":
@@ -85,24 +88,24 @@ def move_lamp(emitter, place, strength) -> None:
 
 
 def strength_of(emitter):
-    """Return the RGB intensity of a point light, or the RGB irradiance of a directional light. It is attached."""
+    """Return the RGB intensity of a point light, or the RGB irradiance of a directional light, with its gradients."""
     name = "intensity.value" if emitter.class_name() == "PointLight" else "irradiance.value"
     return mi.Color3f(mi.traverse(emitter)[name])
 
 
 def shared_emitters(scene, rooms: bool = False) -> list:
-    """List the emitters of a scene that light every photograph. A `flash` is not listed: it is the light of one.
+    """List the emitters of a scene that light every photograph. `flash` emitters are left out: they light only one.
 
-    `rooms`: also list `room` emitters. By default they are left out, because their light is in `Photographs.room`.
+    `rooms`: also list `room` emitters, whose light most renderers of mi_ring compute in another way.
     """
     return [e for e in scene.emitters() if not is_flash(e) and (rooms or not is_room(e))]
 
 
 def is_flash(emitter) -> bool:
-    """Test whether an emitter is a `flash`. This works for the classes of all variants of Mitsuba."""
+    """Return True if an emitter is a `flash`, in any variant of Mitsuba."""
     return getattr(emitter, "of_photographs", False)
 
 
 def is_room(emitter) -> bool:
-    """Test whether an emitter is a `room`. This works for the classes of all variants of Mitsuba."""
+    """Return True if an emitter is a `room`, in any variant of Mitsuba."""
     return getattr(emitter, "of_rooms", False)

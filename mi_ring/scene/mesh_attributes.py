@@ -10,7 +10,7 @@ from mi_ring.errors import SceneError
 
 
 class Members(mi.TraversalCallback):
-    """Collects all named members of a Mitsuba object, in `found`. `mi.traverse` would collect only numbers.
+    """The members of a Mitsuba object: `found` is a list of (name, value), also of values that are no numbers.
 
     This class is not local to a function. Python frees a local class late, together with the objects that it has seen,
     and Dr.Jit compiles every BSDF in memory into the kernels of all scenes.
@@ -26,7 +26,7 @@ class Members(mi.TraversalCallback):
 
 
 def textures_of(bsdf) -> Iterator[tuple[str, mi.Texture]]:
-    """Yield (name, texture) of all textures in a BSDF or texture, also in objects that are nested in it."""
+    """Yield (name, texture) for each texture in a BSDF, and for those in nested BSDFs and textures."""
     for name, value in Members(bsdf).found:
         if isinstance(value, mi.Texture):
             yield name, value
@@ -35,7 +35,7 @@ def textures_of(bsdf) -> Iterator[tuple[str, mi.Texture]]:
 
 
 def attribute_of(texture) -> str | None:
-    """Return the name of the mesh attribute that a texture reads; None for a texture of another kind.
+    """Return the name of the mesh attribute that a Mitsuba texture reads; None for other kinds of textures.
 
     Raises SceneError if the name cannot be found.
     """
@@ -56,9 +56,9 @@ def attributes_of(bsdf) -> set[str]:
 
 
 def require_attributes(shape) -> None:
-    """Raise SceneError if a shape lacks a mesh attribute that its BSDF reads, or has one with a wrong channel count.
+    """Raise SceneError if a shape does not have a mesh attribute that its BSDF reads, or if the channel count is wrong.
 
-    Mitsuba would render such a shape black, without an error.
+    Mitsuba itself would render such a shape black, without an error.
     """
     bsdf = shape.bsdf()
     for name in sorted(attributes_of(bsdf)):
@@ -75,7 +75,10 @@ def require_attributes(shape) -> None:
 
 
 def constant_values(bsdf) -> dict[str, list]:
-    """Return lists of the values of a BSDF's constant textures, by name. Nested BSDFs may give several values."""
+    """Return the constant parameters of a BSDF, such as colours without a texture: lists of values by parameter name.
+
+    A list has several values if nested BSDFs have parameters of the same name.
+    """
     values = {}
     for key, value in mi.traverse(bsdf):
         head, _, tail = key.rpartition(".")

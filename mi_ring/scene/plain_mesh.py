@@ -1,4 +1,4 @@
-"""Makes meshes of Mitsuba's own class."""
+"""Makes Mitsuba meshes from arrays."""
 
 import mitsuba as mi
 import numpy as np
@@ -8,9 +8,9 @@ POSITIONS, FACES = "vertex_positions", "faces"
 
 
 def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
-    """Make a mesh of vertices (V, 3) and faces (F, 3).
+    """Make a Mitsuba mesh from vertices (V, 3) and triangles `faces` (F, 3).
 
-    `normals`: the mesh gets smooth vertex normals. `uv` (V, 2): texture coordinates.
+    `normals`: True: smooth vertex normals; False: flat triangles. `uv` (V, 2): texture coordinates; None: none.
     """
     mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=uv is not None)
     params = mi.traverse(mesh)
@@ -23,5 +23,5 @@ def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
 
 
 def scene_of(vertices, faces) -> mi.Scene:
-    """Make a scene that contains one mesh, with smooth normals: vertices (V, 3), faces (F, 3)."""
+    """Make a scene that contains one mesh with smooth normals. `vertices` (V, 3), `faces` (F, 3): triangles."""
     return mi.load_dict({"type": "scene", "mesh": mesh_of(vertices, faces)})

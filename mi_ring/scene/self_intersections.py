@@ -9,11 +9,11 @@ HIT_OFFSET = 1e-6  #: step of a ray past a hit, for a mesh of size 1: more than 
 
 
 def crossing_triangles(vertices, faces) -> np.ndarray:
-    """Find the triangles of a mesh that cross another triangle. Returns (F,) bool.
+    """Find self-intersections of a mesh. Returns (F,) bool: True for each triangle that crosses another one.
 
-    The mesh, vertices (V, 3) and faces (F, 3), has no seams: neighbours share vertices. Two triangles cross if an edge
-    of one pierces the other. To find this, all edges are traced as rays. An edge does not pierce triangles that contain
-    one of its vertices. Triangles that overlap in one plane do not count.
+    `vertices` (V, 3), `faces` (F, 3): the mesh, in which neighbours share vertices. Two triangles cross if an edge of
+    one pierces the other; both are then True. Triangles that only touch at a shared vertex or edge do not cross.
+    Triangles that overlap in one plane are not found. All edges are traced as rays.
     """
     vertices, faces = np.asarray(vertices, float), np.asarray(faces)
     low, high = vertices.min(0), vertices.max(0)

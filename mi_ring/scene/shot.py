@@ -27,7 +27,7 @@ NO_FILES = Files()
 
 
 class Window(NamedTuple):
-    """A rectangle of a photograph, and the size to which this rectangle is reduced."""
+    """A rectangle of a photograph, and the smaller size to which its pixels are reduced."""
 
     corner: tuple[int, int]  #: first column and row [px of the photograph]
     extent: tuple[int, int]  #: width and height [px of the photograph]
@@ -36,12 +36,12 @@ class Window(NamedTuple):
 
     @property
     def scale(self) -> np.ndarray:
-        """Factors (2,) by which width and height of the rectangle are reduced."""
+        """Factors (2,) by which width and height of the rectangle are divided, 1 or more."""
         return np.divide(self.extent, self.size)
 
     @property
     def blocks(self) -> int:
-        """Side of the square blocks of pixels that the first step of the reduction averages [px]."""
+        """Side [px] of square blocks of pixels. The first step of the reduction averages each block."""
         blocks = int(self.scale.min())
         while any(side % blocks for side in self.extent):
             blocks -= 1
@@ -55,9 +55,11 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class Response:
-    """How a camera records radiance. With the default values the recorded value is the radiance itself.
+    """How a camera records radiance. With the default values, the recorded value is the radiance itself.
 
-    The recorded linear value is `contrasted`((radiance · `gain` · cosine ^ `vignetting`) ^ `gamma`, `contrast`).
+    The recorded linear value is C((radiance · `gain` · cosine ^ `vignetting`) ^ `gamma`). C is an S-curve of exponent
+    `contrast` on the sRGB value v: v ↦ vᶜ / (vᶜ + (1 − v)ᶜ). The cosine is between the ray of the pixel and the optical
+    axis.
     """
 
     gamma: float = 1.0  #: exponent of the camera's curve
@@ -68,16 +70,16 @@ class Response:
     def changed(
         self, gamma: float = 1.0, contrast: float = 1.0, vignetting: float = 0.0, gain: ArrayLike = 1.0
     ) -> "Response":
-        """Return a changed response: `gamma`, `contrast` and `gain` are factors, `vignetting` is added."""
+        """Return a changed copy. `gamma`, `contrast` and `gain` multiply the old values; `vignetting` is added."""
         red, green, blue = np.multiply(self.gain, gain).tolist()
         return Response(self.gamma * gamma, self.contrast * contrast, self.vignetting + vignetting, (red, green, blue))
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A photograph of a capture: camera, light, response and files, as plain values. It does not hold the pixels.
+    """A photograph of a capture without its pixels: camera, light, response and files, as plain values.
 
-    A shot cannot be changed. `dataclasses.replace` makes one with other fields.
+    The fields cannot be assigned. `dataclasses.replace` makes a copy with other fields.
     """
 
     name: str  #: the sensor's id in the scene file
@@ -92,7 +94,10 @@ class Shot:
     window: Window | None = None  #: the part of its files that it shows, with the camera of that part; None: all
 
     def through(self, window: Window) -> "Shot":
-        """Return this photograph, cropped to a window and reduced. The camera changes accordingly."""
+        """Return a copy that is cropped to a window and reduced to its size. The camera is that of the window.
+
+        The shot must be a whole photograph.
+        """
         camera = self.camera
         camera = camera._replace(focal=camera.focal / window.scale, size=window.size,
                                  centre=(camera.centre - window.corner) / window.scale)  # fmt: skip
@@ -100,7 +105,7 @@ class Shot:
 
     @property
     def whole(self) -> "Shot":
-        """The photograph of which this shot is a part: the inverse of `through`. A whole photograph returns itself."""
+        """The shot of the whole photograph, if this shot is a cropped or reduced one; otherwise the shot itself."""
         if self.window is None:
             return self
         camera, scale = self.camera, self.window.scale
@@ -110,7 +115,7 @@ class Shot:
 
     @property
     def frame(self) -> np.ndarray:
-        """First and last corner (2, 2) of the whole photograph, in pixels of this part."""
+        """First and last corner (2, 2) of the whole photograph as (x, y), in pixels of this cropped or reduced shot."""
         if self.window is None:
             return np.array([(0, 0), self.size])
         return (np.array([(0, 0), self.window.whole]) - self.window.corner) / self.window.scale
@@ -131,9 +136,10 @@ class Shot:
         return self.light or Light("point", self.camera.position, np.ones(3))
 
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Shot":
-        """Return this photograph with camera and light in another frame: x ↦ scale · rotation (3, 3) x + shift (3,).
+        """Return a copy with camera and light in another frame: a point x becomes scale · rotation · x + shift.
 
-        The intensity of a point light is scaled so that irradiances do not change.
+        `rotation` (3, 3), `shift` (3,). The intensity of a point light is multiplied by the square of `scale`, so that
+        irradiances stay the same.
         """
         light = self.own_light
         if light.kind == "point":  # scaled so that irradiance does not change

@@ -15,16 +15,17 @@ SURFACE_OFFSET = 1e-5  #: of rays from the surface, for a mesh of size 1: more t
 
 
 class MaskedCamera(NamedTuple):
-    """The camera of a photograph together with its valid pixels."""
+    """The camera of a photograph, and which of its pixels are valid."""
 
     camera: Camera
     valid: np.ndarray | None  #: (H, W) uint8, 0 where a pixel is not valid; None if all are
 
 
 class Visibility:
-    """Tests which points of a mesh at least one camera sees. The mesh: vertices (V, 3) [scene units], faces (F, 3).
+    """Tests which points of a mesh are seen by at least one of the cameras `views`.
 
     A camera sees a point if the point faces the camera, projects to a valid pixel, and is not hidden by the mesh.
+    `vertices` (V, 3) [scene units], `faces` (F, 3): the mesh.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]) -> None:
@@ -38,11 +39,19 @@ class Visibility:
         self.views = list(dict(zip(keys, views)).values())
 
     def of_vertices(self) -> np.ndarray:
-        """Test which vertices are seen. Returns (V,) bool. Smooth normals decide whether a vertex faces a camera."""
+        """Test all vertices of the mesh. Returns (V,) bool: True if at least one camera sees the vertex.
+
+        A camera sees a vertex if the smooth normal points to the camera's side, if the vertex projects to a valid
+        pixel, and if the mesh does not hide it.
+        """
         return self.of_points(self.vertices, np.array(mi.traverse(self.mesh)["vertex_normals"]).reshape(-1, 3))
 
     def of_points(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Test which points (N, 3) [scene units] of the surface are seen. Returns (N,) bool. `normals` (N, 3): unit."""
+        """Test points of the surface. Returns (N,) bool: True if at least one camera sees the point.
+
+        A camera sees a point if the normal points to the camera's side, if the point projects to a valid pixel, and if
+        the mesh does not hide it. `points` (N, 3): [scene units]. `normals` (N, 3): unit normals at the points.
+        """
         points, normals = np.asarray(points, float), np.asarray(normals, float)  # trimesh has arrays of its own
         seen = np.zeros(len(points), bool)
         start = (points - self.center) / self.size + SURFACE_OFFSET * normals
@@ -62,7 +71,10 @@ class Visibility:
 
 
 def in_picture(view: MaskedCamera, points: np.ndarray) -> np.ndarray:
-    """Test which points (N, 3) [scene units] are in front of the camera and project to a valid pixel: (N,) bool."""
+    """Test which points are in front of a camera and project to a valid pixel. Returns (N,) bool.
+
+    `points` (N, 3): [scene units]. Whether something hides a point is not tested.
+    """
     pixels, depth = view.camera.project(points)
     inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < view.camera.size).all(1)
     if view.valid is not None:
@@ -74,10 +86,10 @@ def in_picture(view: MaskedCamera, points: np.ndarray) -> np.ndarray:
 def visible_points(
     ring: RenderedObject, s: np.ndarray, faces: np.ndarray, views: Sequence[MaskedCamera]
 ) -> tuple[np.ndarray, float]:
-    """Find which part of a fitted object the photographs show.
+    """Find what the photographs show of an object. Returns (seen (V,) bool, share of the surface that is not seen).
 
-    Returns (which vertices are seen (V,) bool, share of the surface area that is not seen). `s` (V, 3), `faces` (F, 3):
-    a mesh of the domain of `ring`.
+    `seen` is True for the vertices that at least one photograph shows. `s` (V, 3): vertices on the domain of `ring`,
+    the start surface. `faces` (F, 3): triangles. `views`: cameras of the photographs.
     """
     with torch.no_grad():
         vertices = ring.surface(torch.as_tensor(s, device=ring.center.device)).cpu().numpy()

@@ -1,4 +1,4 @@
-"""Loads XML elements as Mitsuba objects."""
+"""Loads parts of scene files (XML elements) as Mitsuba objects."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -8,7 +8,7 @@ from mi_ring.errors import InputError
 
 
 def require_parts(root: ElementTree.Element) -> None:
-    """Raise RuntimeError if an element in `root` lacks a part whose absence would crash Mitsuba."""
+    """Raise RuntimeError if a bitmap in `root` has no file name, or a blendbsdf is empty. Mitsuba would crash."""
     for element in root.iter():
         if element.get("type") == "bitmap" and element.find("string[@name='filename']") is None:
             raise RuntimeError("bitmap: filename is missing")
@@ -25,7 +25,7 @@ def load_element(element: ElementTree.Element) -> mi.Object:
 
 
 def load_bsdf(xml: str) -> mi.BSDF:
-    """Load a <bsdf> element, given as a text of XML. Raises InputError if Mitsuba refuses the element."""
+    """Load a BSDF. `xml`: text of a <bsdf> element. Raises InputError if it is not XML or if Mitsuba refuses it."""
     try:
         return load_element(ElementTree.fromstring(xml))
     except (ElementTree.ParseError, RuntimeError) as error:

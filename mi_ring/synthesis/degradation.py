@@ -1,4 +1,4 @@
-"""Simulates errors: sensor noise, quantisation, varying exposure, and wrong cameras and lights."""
+"""Simulates errors of captures: sensor noise, quantisation, varying exposure, and wrong cameras and lights."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,10 +17,10 @@ HALF_LIMIT = 6e4  #: radiance is clipped to this before it is written as half fl
 
 
 def with_noise(linear: np.ndarray, electrons: float, read: float, random: np.random.Generator) -> np.ndarray:
-    """Return linear values with noise. 1 is full scale.
+    """Return linear values with simulated sensor noise. The value 1 is full scale. Values above 16 are clipped first.
 
-    `electrons`: electrons at full scale, for shot noise; 0: no shot noise. `read`: standard deviation of the read noise
-    [electrons]; without shot noise, the unit is 1/10,000 of full scale.
+    `electrons`: number of electrons at full scale, for shot noise; 0: no shot noise. `read`: standard deviation of the
+    read noise [electrons]; without shot noise, its unit is 1/10,000 of full scale.
     """
     full = electrons or 10_000.0  # unit of read noise if there is no shot noise
     value = np.clip(linear, 0, NOISE_LIMIT) * full
@@ -30,7 +30,10 @@ def with_noise(linear: np.ndarray, electrons: float, read: float, random: np.ran
 
 
 def encode(linear: np.ndarray, kind: Format) -> np.ndarray:
-    """Encode linear pixels (H, W, 3) as linear half floats (exr), linear 16 bits (png16) or 8-bit sRGB (png8)."""
+    """Encode linear pixels (H, W, 3) for an image file of this kind. Values out of range are clipped.
+
+    exr: linear float16. png16: linear uint16. png8: sRGB uint8.
+    """
     if kind == "exr":
         return np.clip(linear, 0, HALF_LIMIT).astype(np.float16)
     if kind == "png16":
@@ -39,10 +42,10 @@ def encode(linear: np.ndarray, kind: Format) -> np.ndarray:
 
 
 def exposures(count: int, spread: float, random: np.random.Generator) -> np.ndarray:
-    """Draw random factors (count, 3) of the exposure of each photograph and colour.
+    """Draw random exposure factors (count, 3): one for each of `count` photographs and each colour.
 
-    They are lognormal. `spread`: standard deviation of the factor that the colours share [%]; the factor of a single
-    colour has a third of it.
+    They are lognormal with median 1. `spread`: standard deviation of the factor that R, G and B of a photograph share
+    [%]; each colour has a further factor with a third of this spread.
     """
     return np.exp(random.normal(0, spread / 100, (count, 1)) + random.normal(0, spread / 300, (count, 3)))
 
@@ -51,12 +54,13 @@ def miscalibrated(
     shots: Sequence[Shot], center: np.ndarray, random: np.random.Generator, turned: float = 0.0, shifted: float = 0.0,
     scaled: float = 0.0,
 ) -> tuple[Shot, ...]:  # fmt: skip
-    """Return the photographs with random errors of cameras and lights.
+    """Return copies of the photographs with random errors of cameras and lights. 0 means no error of this kind.
 
-    Distances below are from the camera to `center` (3,). `turned`: standard deviation of a camera's rotation about each
-    axis [deg] and of its translation along each axis [% of the distance]; the flash moves with the camera. `shifted`:
-    translation of each point light [% of the distance]; its direction in the camera's axes is the same for all.
-    `scaled`: standard deviation of a lognormal factor of each light's intensity [%].
+    `center` (3,): middle of the object; the distance from a camera to it is the unit of translations. `turned`:
+    standard deviation of a camera's rotation about each axis [deg] and of its translation along each axis [% of the
+    distance]; a flash moves with the camera. `shifted`: length of the translation of each point light [% of the
+    distance]; its direction relative to the camera is random but the same for all. `scaled`: standard deviation of a
+    lognormal factor of each light's intensity [%].
     """
     wrong = []
     direction = random.normal(size=3)

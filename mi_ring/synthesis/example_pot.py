@@ -35,7 +35,7 @@ PROFILE = np.array([
 
 
 class ColouredMesh(NamedTuple):
-    """A mesh whose vertices have colours. The colours are linear."""
+    """A mesh with linear RGB colours at its vertices."""
 
     vertices: np.ndarray  #: (V, 3) [mm]
     faces: np.ndarray  #: (F, 3)
@@ -47,9 +47,9 @@ class ColouredMesh(NamedTuple):
 
 
 def pot(level: int = 6) -> ColouredMesh:
-    """Make the closed mesh of a pot: `PROFILE` is rotated about y, and the result is fluted, flattened and sheared.
+    """Make the closed mesh of a pot in mm: a profile that is rotated about y, fluted, flattened and sheared.
 
-    `level`: level of the icosphere whose vertices the mesh has.
+    `level`: number of subdivisions of the icosphere that is deformed to the pot; it has 10 · 4^level + 2 vertices.
     """
     sphere = trimesh.creation.icosphere(subdivisions=level)
     x, y, z = sphere.vertices.T
@@ -68,7 +68,7 @@ def pot(level: int = 6) -> ColouredMesh:
 
 
 def cameras() -> list[Camera]:
-    """Place `VIEWS` cameras evenly around the pot, on a Fibonacci spiral."""
+    """Place `VIEWS` cameras evenly around the pot, all at the same distance. They look at the middle of the pot."""
     result = []
     for k in range(VIEWS):
         y = 1 - 2 * (k + 0.5) / VIEWS
@@ -80,9 +80,9 @@ def cameras() -> list[Camera]:
 
 
 def write_example(folder: Path, spp: int = SPP) -> None:
-    """Render the example capture. Writes scene.xml, images/, masks/ and truth/mesh.ply into an existing folder.
+    """Render the example capture. Writes scene.xml, images/, masks/ and truth/mesh.ply into an existing, empty folder.
 
-    `spp`: light paths per pixel.
+    `spp`: light paths per pixel, a square number.
     """
     vertices, faces, colours = pot()
     mesh = mesh_of(vertices, faces)

@@ -1,4 +1,4 @@
-"""Makes the lights of a synthetic capture: one per photograph, further lamps, and the room."""
+"""Makes the lights of a synthetic capture: the own light of each photograph, further lamps, and the room's light."""
 
 from typing import Literal
 
@@ -22,12 +22,15 @@ def lights_of(
     kind: LightKind, cameras: list[Camera], offset: tuple[float, float, float], spread: float,
     random: np.random.Generator, distance: float = 1.0,
 ) -> list[Light]:  # fmt: skip
-    """Place a light of this `kind` for each camera. Returns one light per camera.
+    """Place the own light of each photograph. Returns one light per camera, in the same order.
+
+    `kind`: "flash": a point light fixed to the camera, at `offset`; "point" or "distant": a point or directional light
+    in a random direction at most `spread` [deg] from the camera, seen from the origin; "lamp": a point light in a
+    random direction at `distance` from the origin, the same for all cameras. `offset`: position of the flash relative
+    to the lens, left, up and forward [distance from the camera to the origin].
 
     The median irradiance of a surface at the origin that faces its light is 1 W/m². All point lights have the same
-    intensity. `offset`: for a flash, its position relative to the lens: left, up and forward [distance from the camera
-    to the origin]. `spread`: for a point or distant light, its largest angle to the camera, seen from the origin [deg].
-    `distance`: for a lamp, its distance from the origin; the lamp has the same place for all cameras.
+    intensity.
     """
     if kind == "flash":
         places = [c.position + np.linalg.norm(c.position) * c.to_world[:3, :3] @ offset for c in cameras]
@@ -43,9 +46,9 @@ def lights_of(
 
 
 def further_lamps(count: int, first: Light, random: np.random.Generator) -> list[Light]:
-    """Place `count` lamps in addition to the lamp `first`. Returns them.
+    """Make `count` point lights in addition to the lamp `first`, all as far from the origin as `first`.
 
-    They are as far from the origin as `first`, in other directions, weaker, and of other colours.
+    Their directions are random and far apart. They are weaker than `first` and have other colours.
     """
     distance, directions = np.linalg.norm(first.vector), [first.vector / np.linalg.norm(first.vector)]
     lights = []
@@ -59,7 +62,10 @@ def further_lamps(count: int, first: Light, random: np.random.Generator) -> list
 
 
 def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
-    """Rotate `position` (3,) about the origin, by a random angle of at most `spread` [rad], in a random direction."""
+    """Rotate `position` (3,) about the origin by a random angle, toward a random side. Returns the new position.
+
+    `spread`: largest angle [rad]. All positions within this angle are equally likely.
+    """
     cosine, turn = random.uniform(np.cos(spread), 1), random.uniform(0, 2 * np.pi)
     axis = position / np.linalg.norm(position)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -69,9 +75,10 @@ def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Gener
 
 
 def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.ndarray:
-    """Draw the light of a random room: spherical harmonics (BASIS, 3) of its radiance, whose mean is about 1.
+    """Draw the light of a random room. Returns spherical harmonics (BASIS, 3) of its RGB radiance, with mean about 1.
 
-    `in_camera`: the light is fixed to the camera; otherwise it is fixed in the world.
+    `kind`: "constant": the same radiance from all directions; "harmonics": it varies with the direction. `in_camera`:
+    True: the light is fixed to the camera; False: it is fixed in the world.
     """
     colour = 1 + TINT * random.uniform(-1, 1, 3)
     room = np.zeros((BASIS, 3))

@@ -1,4 +1,4 @@
-"""Makes the material of the object: any Mitsuba BSDF, a measured BRDF, or two of these in a pattern."""
+"""Makes the material of a synthetic object: any Mitsuba BSDF, a measured BRDF, or two of these in a pattern."""
 
 import re
 import shlex
@@ -29,7 +29,7 @@ class Pattern(NamedTuple):
     uv: np.ndarray  #: (V, 2) texture coordinates of the vertices
 
     def blend(self, first: mi.BSDF, second: mi.BSDF) -> mi.BSDF:
-        """Make a BSDF that is `second` where this texture is 1, and `first` where it is 0."""
+        """Make a BSDF that blends two BSDFs: it is `first` where the texture is 0 and `second` where it is 1."""
         pixels = mi.Bitmap(np.ascontiguousarray(self.weights[..., None], np.float32))
         nearest = {"type": "bitmap", "bitmap": pixels, "raw": True, "filter_type": "nearest", "wrap_mode": "repeat"}
         return mi.load_dict({"type": "blendbsdf", "weight": nearest, "bsdf_0": first, "bsdf_1": second})
@@ -38,9 +38,10 @@ class Pattern(NamedTuple):
 def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str) -> Pattern:
     """Make the pattern for an object with these `vertices` (V, 3).
 
-    `kind`: "stripes", "checks", or an image file: the second material is where the image is bright. `bands`: number of
-    stripes or checks along the axis `up` (0, 1 or 2). The pattern is projected along an axis, so that its edges are
-    sharp on coarse meshes, too. Raises InputError, which names the `field`, if the image cannot be read.
+    `kind`: "stripes", "checks", or the path of an image, whose bright pixels get the second material. `bands`: number
+    of stripes or checks along the axis `up` (0, 1 or 2 for x, y, z). The pattern is projected along a horizontal axis,
+    so that its edges are sharp on coarse meshes, too. `field`: name of the option, for the message. Raises InputError
+    if the image cannot be read.
     """
     low, high = vertices.min(0), vertices.max(0)
     across, height = (up + 1) % 3 if up != 1 else 0, max(high[up] - low[up], 1e-9)
@@ -59,9 +60,12 @@ def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str)
 
 
 def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
-    """Make the BSDF that `text` describes in one of the `FORMS`. `coloured`: the mesh has colours.
+    """Make the BSDF that an option describes.
 
-    Raises InputError, which names the `field`, if that is impossible.
+    `text`: path of an XML file with one <bsdf>, path of a .binary file of the MERL database, FILE.npz:MATERIAL, or a
+    Mitsuba plugin with parameters, such as `principled roughness=0.3`. `field`: name of the option, for messages.
+    `coloured`: the mesh has colours, to which a plugin may refer as vertex_color. Raises InputError if there is no such
+    BSDF.
     """
     file, _, name = text.partition(".npz:")
     path = Path(f"{file}.npz" if name else text)
@@ -92,7 +96,7 @@ def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
 
 
 def explain(message: str) -> str:
-    """Rewrite an error message of Mitsuba about a plugin or its parameters, for the user of the command."""
+    """Rewrite Mitsuba's error message about a plugin or its parameters in words for the user. Returns one line."""
     if unknown := re.findall(r"^ *- \w+ \"([^\"]*)\":", message, re.M):
         return f"has no parameter {' and '.join(unknown)}; Mitsuba's documentation lists those of each plugin"
     if kind := re.search(r"Plugin \"(.*?)\" not found", message):
@@ -106,7 +110,8 @@ def explain(message: str) -> str:
 def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
     """Parse a text like `principled base_color=0.6,0.2,0.1 roughness=0.3`. Returns a dictionary for `mi.load_dict`.
 
-    `coloured`: the mesh has colours. Raises InputError, which names the `field`, if the text is invalid.
+    `field`: name of the option, for messages. `coloured`: the mesh has colours, so a value may be vertex_color. Raises
+    InputError if the text is invalid.
     """
     try:
         name, *words = shlex.split(text)
@@ -126,9 +131,10 @@ def parse_plugin(text: str, field: str, coloured: bool) -> dict[str, Any]:
 
 
 def parse_value(value: str) -> Any:
-    """Parse the value of a parameter for `mi.load_dict`.
+    """Convert the text of a parameter to a value for `mi.load_dict`.
 
-    It is a number, a colour R,G,B, true or false, vertex_color (the colours of the mesh), or any other string.
+    "0.3" becomes a number, "0.6,0.2,0.1" an RGB colour, "true" and "false" booleans, and "vertex_color" a texture that
+    reads the colours of the mesh. Any other text stays a string.
     """
     if value == COLOURS:
         return {"type": "mesh_attribute", "name": COLOURS}

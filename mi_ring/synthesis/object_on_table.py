@@ -1,4 +1,4 @@
-"""The object of a synthetic capture and its table. Renders them under one light."""
+"""Renders the object of a synthetic capture on its table, under one light."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -29,7 +29,11 @@ DOTS_PER_PIXEL = 3  #: dots of the printed page per pixel of the sheet's texture
 
 
 class ObjectOnTable:
-    """An object with its BSDF, and the table on which it stands."""
+    """An object with its BSDF, and the table on which it stands.
+
+    `mesh`: the object. `vertices` (V, 3): its vertices. `tables`: shapes of the table and of a printed sheet on it;
+    empty: no table.
+    """
 
     def __init__(self, mesh: mi.Mesh, vertices: np.ndarray, tables: Iterable[mi.Object] = ()) -> None:
         """Join the object `mesh` and the shapes of the table. `vertices` (V, 3): the vertices of the object."""
@@ -37,12 +41,12 @@ class ObjectOnTable:
         self.scenes: dict[str, mi.Scene] = {}  #: by kind of light
 
     def under(self, emitter: mi.Object) -> mi.Scene:
-        """Make the scene of object and table with this emitter as the only light."""
+        """Make a scene of object and table, with this emitter as its only light."""
         shapes = {f"shape{k}": shape for k, shape in enumerate([self.object, *self.tables])}
         return mi.load_dict({"type": "scene", **shapes, "lamp": emitter}, optimize=False)
 
     def lit_by(self, light: Light) -> mi.Scene:
-        """The scene with this light only, until the next call.
+        """Return the scene of object and table under this light only. The next call may change this scene.
 
         Lights of a kind share a scene, because it takes Mitsuba seconds to prepare a fine mesh for rays.
         """
@@ -56,10 +60,12 @@ class ObjectOnTable:
     def radiance(
         self, view: LensCamera, light: Light | mi.Object, spp: int, seed: int, depth: int, hidden: bool = True
     ) -> np.ndarray:
-        """Render linear radiance (H, W, 3) under one light.
+        """Render object and table under one light. Returns linear radiance (H, W, 3).
 
-        `spp`: paths per pixel. `depth`: largest length of paths. `hidden`: an environment map is invisible to the
-        camera; then, without a table, pixels away from the object are 0.
+        `light`: a point or directional light, for which rare very bright paths are clipped, or a Mitsuba emitter.
+        `spp`: paths per pixel, a square number. `depth`: largest length of paths; 2: direct light only. `hidden`: True:
+        the emitter is invisible to the camera, and without a table only the part of the picture around the object is
+        rendered; the rest is 0.
         """
         if isinstance(light, Light):
             middle = (self.vertices.min(0) + self.vertices.max(0)) / 2
@@ -73,7 +79,10 @@ class ObjectOnTable:
         return pixel_means(trace, view, window, spp, seed)
 
     def coverage(self, view: LensCamera, spp: int = 64) -> np.ndarray:
-        """Render the coverage (H, W): the share of each pixel that shows the object."""
+        """Render which share of each pixel shows the object. Returns (H, W) in [0, 1].
+
+        `spp`: rays per pixel, a square number.
+        """
         if "none" not in self.scenes:
             self.scenes["none"] = self.under(mi.load_dict({"type": "constant"}))
         trace = partial(hits_along, scene=self.scenes["none"], shape=self.object)
@@ -81,11 +90,12 @@ class ObjectOnTable:
 
 
 def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimesh, np.ndarray | None, np.ndarray]:
-    """Read a mesh file. Returns (mesh, linear colours of its vertices (V, 3) or None, transform (4, 4)).
+    """Read a mesh file, move it to the origin and scale it. Returns (mesh, colours (V, 3) or None, transform (4, 4)).
 
-    The transform has been applied: it moves the middle of the bounding box to the origin and scales the distance of the
-    farthest vertex to `radius`. `smooth`: subdivide the mesh by Loop's rule to at least `SMOOTH` vertices. Raises
-    InputError if the file has no surface or cannot be subdivided.
+    The middle of the bounding box is moved to the origin, and the farthest vertex gets the distance `radius`. The
+    returned transform from the file's coordinates has been applied. Colours are linear, at the vertices; None if the
+    file has none. `smooth`: subdivide the mesh by Loop's rule to at least 10,000 vertices. Raises InputError if the
+    file has no surface or cannot be subdivided.
     """
     mesh = read_mesh(path, "MESH")
     mesh.remove_unreferenced_vertices()
@@ -119,10 +129,10 @@ def load_object(path: Path, radius: float, smooth: bool) -> tuple[trimesh.Trimes
 
 
 def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, pattern: Pattern | None) -> mi.Mesh:
-    """Make a Mitsuba shape of the object, with smooth normals and this BSDF.
+    """Make a Mitsuba mesh with smooth normals and the material `bsdf`.
 
-    `colours` (V, 3): linear colours of the vertices; None: no colours. `pattern`: gives the texture coordinates; None:
-    no texture coordinates.
+    `colours` (V, 3): linear colours of the vertices, for the mesh attribute vertex_color; None: no such attribute.
+    `pattern`: has the texture coordinates; None: no texture coordinates.
     """
     shape = mesh_of(mesh.vertices, mesh.faces, uv=None if pattern is None else pattern.uv)
     if colours is not None:
@@ -132,10 +142,11 @@ def shape_of(mesh: trimesh.Trimesh, colours: np.ndarray | None, bsdf: mi.BSDF, p
 
 
 def table_elements(folder: Path, ground: np.ndarray, up: np.ndarray, radius: float, sheet: bool) -> list[Element]:
-    """Make the XML elements of a table, and write their textures to `folder`.
+    """Make the XML elements of a table, and write their textures as PNG files into `folder`.
 
-    `ground` (3,): a point of the table. `up` (3,): normal of the table. `radius`: radius of the object. `sheet`: put
-    the printed sheet of mi-ring board on the table; it is a second element.
+    `ground` (3,): centre of the table. `up` (3,): unit normal of the table, one of the axes. `radius`: radius of the
+    object, which sets the table's size. `sheet`: True: a second element is the printed sheet of mi-ring board on the
+    table.
     """
     right = np.roll(up, 1)
     pictures = {"table": (np.broadcast_to(WOOD, (2, 2, 3)), np.full(2, TABLE * radius / 2), BELOW * radius)}

@@ -154,13 +154,13 @@ class SynthesizeConfig:
 
     @property
     def exact(self) -> bool:
-        """Is the calibration in the scene file exact? It is not if an option --wrong-… changes it."""
+        """True if the calibration in the scene file is exact, False if an option --wrong-… changes it."""
         unknown = self.wrong_room and bool(self.room > 0 or self.environment or self.lamps > 1)
         return not (self.wrong_cameras or self.wrong_light or self.wrong_power or self.wrong_exposure or unknown)
 
     @property
     def up_axis(self) -> np.ndarray:
-        """Unit vector (3,) that points up."""
+        """Unit vector (3,) that points up: the x, y or z axis."""
         return np.eye(3)["xyz".index(self.up)]
 
     @property
@@ -180,7 +180,7 @@ RANGES = {
 
 
 def require_options(config: SynthesizeConfig) -> None:
-    """Raise InputError for options that are out of range or contradict each other."""
+    """Raise InputError if an option is out of range, or if two options contradict each other."""
     for name, (least, most) in RANGES.items():
         if not least <= getattr(config, name) <= most:
             raise InputError(f"--{name.replace('_', '-')}: is {getattr(config, name)}, must be {least} to {most}")

@@ -46,7 +46,7 @@ REFERENCES = {
 
 
 class PlannedPhotograph(NamedTuple):
-    """A photograph that will be rendered: camera, light, names and random seed."""
+    """A photograph to render: camera, light, names and random seed."""
 
     camera: Camera
     light: Light  #: brings 1 W/m² to the object
@@ -58,7 +58,7 @@ class PlannedPhotograph(NamedTuple):
 class Studio:
     """The object, lights, room and cameras that the options describe, and functions that render them.
 
-    Raises InputError if a file cannot be read.
+    Its constructor reads the mesh and the materials. Raises InputError if a file cannot be read.
     """
 
     def __init__(self, config: SynthesizeConfig) -> None:
@@ -79,21 +79,23 @@ class Studio:
         self.gains = exposures(config.views, config.wrong_exposure, self.random(6))  #: (views, 3)
 
     def random(self, *purpose: int) -> np.random.Generator:
-        """Make a random generator for one purpose. `purpose`: any integers.
+        """Make a random generator from the option --seed and the integers `purpose`.
 
-        Each purpose has its own generator, so that an option does not change random numbers for another purpose.
+        Each purpose, such as cameras or noise, has its own integers. So an option changes no random numbers of other
+        purposes.
         """
         return np.random.default_rng([self.config.seed, *purpose])
 
     @property
     def ground(self) -> np.ndarray:
-        """Point (3,) of the table: on the vertical axis through the origin, as low as the object's lowest point."""
+        """Point (3,) of the table on the vertical axis through the origin, as low as the object's lowest vertex."""
         return self.config.up_axis * (self.mesh.vertices @ self.config.up_axis).min()
 
     def photographs(self, count: int, novel: bool = False) -> list[PlannedPhotograph]:
         """Plan `count` photographs: cameras, lights, names and seeds. Renders nothing.
 
-        `novel`: photographs to test a fit with, from the viewpoints of a hand-held camera.
+        `novel`: True: photographs to test a fit with, as by a hand-held camera; False: from the viewpoints that
+        --cameras names.
         """
         config = self.config
         pose = poses("free" if novel else config.cameras, count, config.radius, config.camera_distance, config.up_axis,
@@ -109,13 +111,13 @@ class Studio:
                 for k, (camera, light) in enumerate(zip(cameras, lights))]  # fmt: skip
 
     def further_lamps(self, first: Light) -> list[Light]:
-        """Make all lamps except the `first` lamp, which is the own light of each photograph."""
+        """Make all lamps that --lamps asks for, except `first`, which is the own light of each photograph."""
         return light_sources.further_lamps(self.config.lamps - 1, first, self.random(8))
 
     def environment_element(self, scale: float = 1.0) -> Element:
-        """Make the XML of the environment map. `scale`: factor of its radiance.
+        """Make the XML element of the environment map that --environment names, and check that Mitsuba can load it.
 
-        Raises InputError if its file cannot be read.
+        `scale`: factor of its radiance. Raises InputError if the file cannot be read.
         """
         file = Path(str(self.config.environment)).resolve()
         element = ElementTree.Element("emitter", type="envmap")
@@ -131,7 +133,10 @@ class Studio:
         return element
 
     def build(self, folder: Path) -> ObjectOnTable:
-        """Make the object and its table. Writes the textures of the table to `folder`."""
+        """Make object and table, ready for rendering. Writes the textures of the table into `folder`.
+
+        Stores the XML elements of the table in `tables`.
+        """
         config, shapes = self.config, []
         if config.table != "none":
             self.tables = table_elements(folder, self.ground, config.up_axis, config.radius, config.table == "sheet")
@@ -141,10 +146,10 @@ class Studio:
         return ObjectOnTable(self.shape, self.mesh.vertices, shapes)
 
     def radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """Render a photograph under all lamps, or under the environment, but not under the room's light.
+        """Render a photograph under all lamps or under the environment map, without the light of the room.
 
-        Returns linear radiance (H, W, 3). The first lamp brings 1 W/m² to the object. `spp`: paths per pixel. `scale`:
-        how many times smaller the picture is.
+        Returns linear radiance (H, W, 3). The first lamp brings 1 W/m² to the object. `spp`: paths per pixel, a square
+        number. `scale`: factor by which width and height of the picture are divided.
         """
         depth, view = self.config.depth, LensCamera(taken.camera.shrunk(scale))
         light = taken.light if self.environment is None else load_element(self.environment)
@@ -154,9 +159,9 @@ class Studio:
         return picture
 
     def room_radiance(self, scene: ObjectOnTable, taken: PlannedPhotograph, spp: int, scale: int = 1) -> np.ndarray:
-        """Render a photograph under the room's light alone. Returns linear radiance (H, W, 3).
+        """Render a photograph under the light of the room alone. Returns linear radiance (H, W, 3); 0 without a room.
 
-        Arguments: as for `radiance`.
+        `spp`: paths per pixel, a square number. `scale`: factor by which width and height of the picture are divided.
         """
         view = LensCamera(taken.camera.shrunk(scale))
         if not self.config.room:
@@ -166,10 +171,11 @@ class Studio:
         return scene.radiance(view, light, spp, taken.seed + 1, self.config.depth)
 
     def exposure(self, scene: ObjectOnTable, photographs: list[PlannedPhotograph]) -> float:
-        """Choose the pixel value of radiance 1: from --exposure, or so that the share --clipped is overexposed.
+        """Choose the exposure: the pixel value of radiance 1. It comes from the option --exposure or --clipped.
 
-        For --clipped, it renders some photographs in small size. Raises InputError if no pixel shows only the object,
-        or if the object is black.
+        --exposure gives the value. Without it, the share --clipped of the object's pixels is overexposed; to find this,
+        some photographs are rendered in small size. Raises InputError if no pixel shows only the object, or if the
+        object is black.
         """
         config = self.config
         if config.exposure is not None:
@@ -189,10 +195,10 @@ class Studio:
 
 
 def write_capture(config: SynthesizeConfig) -> None:
-    """Write the capture that the options describe. Photographs that exist are not rendered again.
+    """Render and write the capture that the options describe. Photographs that exist already are not rendered again.
 
-    The scene file is written last. Raises InputError if the folder contains anything else, or if a file cannot be read
-    or written.
+    The scene file is written last. Raises InputError if the folder contains other files, or if a file cannot be read or
+    written.
     """
     out, studio = config.out, Studio(config)
     claim(out, config)
@@ -231,10 +237,10 @@ def write_capture(config: SynthesizeConfig) -> None:
 def write_scenes(
     studio: Studio, seen: list[PlannedPhotograph], novel: list[PlannedPhotograph], exposure: float
 ) -> None:
-    """Write scene.xml of the photographs `seen` and truth/scene.xml of the photographs `novel`.
+    """Write scene.xml with the photographs `seen`, and truth/scene.xml with the photographs `novel` that test a fit.
 
-    If scene.xml has simulated errors, also write truth/exact.xml: the same without errors. `exposure`: pixel value of
-    radiance 1.
+    If an option --wrong-… simulates errors, scene.xml has these errors, and truth/exact.xml is the same scene without
+    them. `exposure`: pixel value of radiance 1.
     """
     config, out = studio.config, studio.config.out
     strength = exposure if studio.environment is None else 0.0
@@ -281,7 +287,7 @@ def write_scenes(
 
 
 def digest(file: Path) -> str:
-    """Hash a file and all files that it names, such as textures. Returns the hash as text."""
+    """Hash the contents of a file and of all files that it names, such as textures. Returns 32 hexadecimal digits."""
     result, files = hashlib.blake2b(digest_size=16), [file]
     for each in files:  # the list grows in the loop
         content, kind = each.read_bytes(), each.suffix.lower()
@@ -295,7 +301,10 @@ def digest(file: Path) -> str:
 
 
 def settings_of(config: SynthesizeConfig) -> dict:
-    """Return the options that affect a capture, and hashes of the files that they name, as a JSON value."""
+    """Return the options that affect a capture as a dictionary of JSON values.
+
+    Its key `digests` has hashes of the files that the options name, by option.
+    """
     values = asdict(config) | {"digests": {}}
     del values["out"]
     for name in ("mesh", "material", "second", "pattern", "environment"):
@@ -308,7 +317,10 @@ def settings_of(config: SynthesizeConfig) -> dict:
 
 
 def claim(out: Path, config: SynthesizeConfig) -> None:
-    """Raise InputError if the folder `out` contains anything but this capture, complete or not."""
+    """Raise InputError if the folder `out` contains anything but a capture with these options, complete or not.
+
+    A missing or empty folder is accepted. Writes nothing.
+    """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     found = read_json(out / SETTINGS)

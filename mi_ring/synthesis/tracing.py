@@ -1,4 +1,7 @@
-"""Renders images by Mitsuba's path tracer along its own rays. It shares no code with the renderer of a fit."""
+"""Renders images by Mitsuba's path tracer along rays of its own.
+
+It shares no code with the renderer of a fit, so that it can test that renderer.
+"""
 
 import functools
 from collections.abc import Callable
@@ -21,14 +24,14 @@ Trace = Callable[[mi.RayDifferential3f, int], list]  #: (rays, seed) ↦ list of
 
 @dataclass(frozen=True)
 class LensCamera:
-    """A camera with lens distortion and motion blur."""
+    """A pinhole camera with lens distortion and motion blur."""
 
     camera: Camera
     distortion: tuple[float, float] = (0.0, 0.0)  #: k1, k2: x / z and y / z are multiplied by 1 + k1 r² + k2 r⁴
     motion: tuple[float, float] = (0.0, 0.0)  #: shift of the image during the exposure [px]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points (n, 3), at the middle of the exposure. Returns pixel coordinates (n, 2)."""
+        """Project points (n, 3) [scene units] at the middle of the exposure. Returns pixel coordinates (n, 2)."""
         x, y, z = ((points - self.camera.position) @ self.camera.to_world[:3, :3]).T
         tangents = np.stack([-x / z, -y / z], 1)
         r2 = (tangents**2).sum(1, keepdims=True)
@@ -36,9 +39,9 @@ class LensCamera:
         return tangents * (1 + k1 * r2 + k2 * r2**2) * self.camera.focal + self.camera.centre
 
     def around(self, points: np.ndarray) -> Window:
-        """Return the smallest window of the image that shows points (n, 3), with a margin of `MARGIN` pixels.
+        """Return the smallest window of the image that contains the projections of points (n, 3), plus `MARGIN` pixels.
 
-        The points must be in front of the camera.
+        The points must be in front of the camera. A window is (left, top, right, bottom) [px].
         """
         pixels, size = self.project(points), np.array(self.camera.size)
         left, top = np.clip(pixels.min(0) - MARGIN, 0, size - 1).astype(int).tolist()
@@ -47,9 +50,9 @@ class LensCamera:
 
 
 def rays_of(view: LensCamera, window: Window, spp: int, seed: int) -> mi.RayDifferential3f:
-    """Make `spp` stratified rays through each pixel of a window. `spp` must be a square number.
+    """Make stratified random rays through each pixel of a window. Consecutive rays belong to the same pixel.
 
-    The rays of a pixel are in consecutive lanes.
+    `window`: (left, top, right, bottom) [px]. `spp`: rays per pixel, a square number.
     """
     left, top, right, bottom = window
     side = round(spp**0.5)
@@ -76,7 +79,7 @@ def rays_of(view: LensCamera, window: Window, spp: int, seed: int) -> mi.RayDiff
 
 
 def radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth: int, hidden: bool = False) -> list:
-    """Trace rays by Mitsuba's `path`. Returns the radiance [R, G, B] of each ray.
+    """Trace light paths along rays by Mitsuba's path tracer. Returns three channels: RGB radiance of each ray.
 
     `depth`: largest length of paths; 2: direct light only. `hidden`: emitters are invisible to the camera.
     """
@@ -87,9 +90,10 @@ def radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth
 
 
 def clamped_radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, depth: int, limit: float) -> list:
-    """Trace rays as `radiance_along` does, but clip indirect radiance to `limit`.
+    """Trace light paths along rays by Mitsuba's path tracer, and clip indirect radiance to `limit`.
 
-    Otherwise rare bright paths would leave white dots in the image.
+    Otherwise rare bright paths would leave white dots in the image. `depth`: largest length of paths; 2: direct light
+    only. Returns a list of three channels: RGB radiance of each ray.
     """
     direct = radiance_along(rays, seed, scene, 2)
     if depth == 2:
@@ -98,15 +102,19 @@ def clamped_radiance_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scen
 
 
 def hits_along(rays: mi.RayDifferential3f, seed: int, scene: mi.Scene, shape: mi.Shape) -> list:
-    """Trace rays to their first hit. Returns one channel: 1 if the ray hits `shape`, otherwise 0."""
+    """Trace rays to their first hit. Returns a list of one channel: 1 if a ray hits `shape` first, otherwise 0.
+
+    `seed` is not used; it belongs to the common signature.
+    """
     hit = scene.ray_intersect_preliminary(rays)
     return [dr.select(hit.is_valid() & (hit.shape == mi.ShapePtr(shape)), mi.Float(1), 0)]
 
 
 def pixel_means(trace: Trace, view: LensCamera, window: Window, spp: int, seed: int) -> np.ndarray:
-    """Average the function `trace` over the rays of each pixel. Returns an image (H, W, channels).
+    """Average a function over the rays of each pixel. Returns an image (H, W, channels) of the camera's size.
 
-    Only pixels in the `window` are rendered; the others are 0. `spp`: rays per pixel.
+    `trace`: takes (rays, seed), returns a list of channels with a value for each ray. `window`: (left, top, right,
+    bottom) [px]; pixels outside are 0 and are not rendered. `spp`: rays per pixel, a square number.
     """
     left, top, right, bottom = window
     rows = max(1, LANES // ((right - left) * spp))

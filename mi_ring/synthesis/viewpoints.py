@@ -1,4 +1,4 @@
-"""Makes camera poses: evenly around the object, as if hand-held, or around a turntable."""
+"""Makes camera poses: evenly around an object, as if hand-held, or around a turntable."""
 
 from typing import Literal
 
@@ -16,7 +16,8 @@ GOLDEN = np.pi * (3 - np.sqrt(5))  #: golden angle [rad] of a Fibonacci spiral, 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray, roll: float = 0.0) -> np.ndarray:
     """Make the camera-to-world matrix (4, 4) of a camera that looks from `position` to `target`; all are (3,).
 
-    The axes are x left, y up, z forward. `roll`: rotation about the viewing direction [rad].
+    The camera's axes are x left, y up, z forward. `up`: direction that is up in the picture; if it is nearly the
+    viewing direction, another one is taken. `roll`: rotation about the viewing direction [rad].
     """
     forward = (target - position) / np.linalg.norm(target - position)
     if abs(forward @ up) > 0.99 * np.linalg.norm(up):  # the camera looks along `up`: take another direction
@@ -35,9 +36,10 @@ def poses(
 ) -> list[np.ndarray]:  # fmt: skip
     """Place `count` cameras around an object at the origin. Returns camera-to-world matrices (4, 4).
 
-    `radius`: radius of the object. `distance`: distance of the cameras from the origin. `up` (3,): up direction.
-    `elevations`: angles of the rings of cameras above the turntable [deg]. `standing`: the object stands on a table, so
-    no camera is below it.
+    `kind`: "around": evenly in all directions; "free": random directions, distances and roll, as if hand-held;
+    "turntable": in horizontal rings. `radius`: radius of the object. `distance`: from the origin to a camera. `up`
+    (3,): up direction. `elevations`: angles of the rings above the horizontal plane [deg]. `standing`: True: the object
+    stands on a table, so no camera of the first two kinds is below it.
     """
     upright = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])[0].as_matrix()
     low = LOWEST if standing else -1.0

@@ -1,4 +1,4 @@
-"""The cache folder. Its files can be made again. When there are too many, some are removed."""
+"""The cache folder. Its files can be computed again. When they get too large, those not used for long are removed."""
 
 import contextlib
 import os
@@ -17,16 +17,19 @@ PRUNED = 0.8  #: share of the limit that is left after files were removed
 
 
 def cache_folder() -> Path:
-    """Return the folder of our cached files.
+    """Return the folder that contains the cached files.
 
-    It is in the folder that the environment variable `MI_RING_CACHE` names, or else in the user's cache folder.
+    It lies in the folder that the environment variable `MI_RING_CACHE` names, or else in the user's cache folder.
     """
     named = os.environ.get(VARIABLE)
     return (Path(named) if named else Path(platformdirs.user_cache_dir("mi_ring", appauthor=False))) / OWN
 
 
 def cached(key: str) -> Path | None:
-    """Return the path of the file with this key, or None if there is none. The file is marked as used now."""
+    """Return the path of the cached file with this key; None if there is none. Sets its modification time to now.
+
+    `key`: 32 hexadecimal digits, the name of the file.
+    """
     path = cache_folder() / key
     with contextlib.suppress(OSError):  # in a folder that is only read
         os.utime(path)
@@ -34,7 +37,10 @@ def cached(key: str) -> Path | None:
 
 
 def store(key: str, content: bytes | memoryview) -> bool:
-    """Write a file with this key, which is 32 hexadecimal digits. Returns False if it cannot be written."""
+    """Write a file into the cache. Returns True if it was written, False if that failed.
+
+    `key`: name of the file, 32 hexadecimal digits, usually a hash of what the content was computed from.
+    """
     from mi_ring.system.files import write_file  # which needs torch; the rest of this module does not
 
     try:
@@ -62,7 +68,10 @@ def size() -> int:
 
 
 def prune(limit: int = LIMIT) -> None:
-    """If the total size is above `limit` [bytes], remove the files that were not used for the longest time."""
+    """If the cache is larger than `limit` [bytes], remove the files that were not used for the longest time.
+
+    Afterwards it has at most 80 % of `limit`.
+    """
     several = sorted(files())
     total = sum(own for _, own, _ in several)
     least = total if total <= limit else PRUNED * limit

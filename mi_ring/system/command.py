@@ -34,11 +34,12 @@ def parse(
     config_type: Any, arguments: Sequence[str], program: str, default: Any = tyro.MISSING_NONPROP,
     description: str | None = None, needs_llvm: bool = True,
 ) -> Any:  # fmt: skip
-    """Parse the arguments of a command. Returns an instance of `config_type`, which is a dataclass.
+    """Parse the arguments of a command. Returns an instance of the dataclass `config_type`.
 
-    `program`: name of the command in the help. `description`: beginning of the help, by --help or --help-all; default:
-    the docstring of the dataclass. Raises InputError for wrong arguments. With `needs_llvm`, it also raises InputError
-    if there is no LLVM, but not for the help.
+    `program`: name of the command in the help. `default`: an instance whose values replace the defaults of the
+    dataclass. `description`: first text of the help; None: the docstring of the dataclass. With --help or --help-all,
+    the help is printed and the process ends. Raises InputError for wrong arguments. With `needs_llvm`, also raises
+    InputError if LLVM is missing.
     """
     if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # set by the import of mi_ring
         signal.signal(signal.SIGINT, receive)  # from here on, there may be partial files to remove
@@ -65,10 +66,9 @@ def require_utf8(name: str) -> None:
 
 
 def complaint_in(box: str) -> str:
-    """Return the error message in a box that tyro has printed, as one line.
+    """Return the error message in a box that tyro has printed, as one line. `box`: all lines of the box.
 
-    The box has a title, the message, and advice. Horizontal rules separate them. Two parts of the advice are used:
-    options of similar spelling, and the help of the option. If the output is not UTF-8, the box has no sides.
+    Options of similar spelling are added to the message, and what the help of the option says about its values.
     """
     if "│" in box:
         lines = [line.strip("│") for line in box.splitlines() if line.startswith("│")]
@@ -88,9 +88,9 @@ def complaint_in(box: str) -> str:
 
 
 def plain(complaint: str, help_text: str) -> str:
-    """Return an error message of tyro in our form: option, value found, values allowed.
+    """Rewrite an error message of tyro in our form: option, value found, values allowed. Returns a line.
 
-    `help_text`: help of the option.
+    `help_text`: tyro's help of the option, which may list the allowed values; empty if there is none.
     """
     if wrong := re.match(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", complaint):
         choices = wrong[3].replace("'", "").split(", ")
@@ -118,23 +118,23 @@ def plain(complaint: str, help_text: str) -> str:
 
 
 def name_in_help(name: str) -> str:
-    """Return the name of an argument as the help shows it."""
+    """Return the name of an argument as the help shows it: options (--name) unchanged, other names in capitals."""
     return name if name.startswith("--") else name.upper()
 
 
 def scene_name(scene: Path) -> str:
-    """Return the name of a scene: its file name without suffix. For a file scene.xml, it is the name of its folder."""
+    """Return a name for a scene: its file name without suffix; for a file scene.xml, the name of its folder."""
     return scene.stem if scene.stem != "scene" else scene.resolve().parent.name
 
 
 def one_line(message: str) -> str:
-    """Return a message without line breaks. If it is longer than `MAX_MESSAGE`, its middle is left out."""
+    """Return a message without line breaks. If it is longer than `MAX_MESSAGE` characters, its middle is left out."""
     words = " ".join(message.split())
     return words if len(words) <= MAX_MESSAGE else f"{words[: MAX_MESSAGE // 2]} … {words[-MAX_MESSAGE // 2 :]}"
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised when one of the `SIGNALS` has arrived. Its argument is the number of the signal."""
+    """Raised when a signal asks the process to stop, such as SIGTERM. Its argument is the number of the signal."""
 
 
 def exit_status(stop: KeyboardInterrupt) -> int:
@@ -155,16 +155,19 @@ def receive(number: int, frame: object) -> None:
 
 
 def interrupted() -> bool:
-    """Return whether `receive` has handled a signal. Native code may have turned it into another error."""
+    """Return True if a stop signal has arrived, and `receive` has handled it.
+
+    Ask it after an exception: native code may have turned the interruption into another error.
+    """
     return bool(_received)
 
 
 @contextlib.contextmanager
 def resumable() -> Iterator[None]:
-    """A context manager for work that the same command can continue. On a signal of `SIGNALS`, it prints this hint.
+    """A context manager for work that the same command can continue. A stop signal makes it print this advice.
 
-    It then raises Interrupted, even if a library turns the signal into another error. Only the main thread receives
-    signals.
+    It then raises Interrupted, even if a library has turned the interruption into another error. In a thread other than
+    the main thread, it handles no signals.
     """
 
     handled = []
@@ -187,7 +190,10 @@ def resumable() -> Iterator[None]:
 
 
 def make_callable(module: str, function: Callable) -> None:
-    """Make the module of a command callable. Then `mi_ring.evaluate(…)`, for example, calls `function`."""
+    """Let a module be called like `function`. So `mi_ring.evaluate(…)` works, although `evaluate` is a module.
+
+    `module`: full name of an imported module.
+    """
 
     class CallableModule(ModuleType):
         __call__ = staticmethod(function)
@@ -196,9 +202,11 @@ def make_callable(module: str, function: Callable) -> None:
 
 
 def run(program: str, main: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> None:
-    """Run a command, and exit. A user error is printed as one line on standard error, and the exit status is 2.
+    """Run a command and exit the process. The exit status is what `main` returns, 0 for None.
 
-    If `--traceback` is among the arguments, the traceback is printed instead.
+    `program`: name of the command, for messages. `main`: takes the list of arguments. `arguments`: None: those of the
+    process. A user error is printed as one line on standard error, with exit status 2. If `--traceback` is among the
+    arguments, the error is raised instead.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     traceback = "--traceback" in arguments

@@ -1,4 +1,4 @@
-"""Writes files such that they are complete or absent. Also computes checksums, and locks folders."""
+"""Writes files such that they are complete or absent. Also computes checksums and locks folders."""
 
 import contextlib
 import errno
@@ -28,7 +28,7 @@ END, COMMENT = b"PK\x05\x06", 20  #: of the last record of a zip file: signature
 def writing(what: Path | str) -> Iterator[None]:
     """A context manager that turns an OSError, such as a full disk, into an InputError.
 
-    The message begins with `what`.
+    `what`: the beginning of the message: path of the file, or path and option.
     """
     try:
         yield
@@ -40,7 +40,7 @@ def writing(what: Path | str) -> Iterator[None]:
 def require_place(path: Path, field: str = "") -> None:
     """Create the folder of the file `path`, and check that files can be written there. Raises InputError if not.
 
-    Call it before long work whose result goes to this file.
+    Call it before long work whose result goes to this file. `field`: name of the option, for the message; empty: none.
     """
     with writing(f"{path}: {field}" if field else path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,22 +48,25 @@ def require_place(path: Path, field: str = "") -> None:
 
 
 def relative_to(folder: Path, path: Path) -> str:
-    """Return a path relative to a folder, with forward slashes. On another drive (Windows), it is absolute."""
+    """Return `path` relative to `folder`, with forward slashes; unchanged if it is on another drive (Windows)."""
     with contextlib.suppress(ValueError):
         path = Path(os.path.relpath(path, folder))
     return path.as_posix()
 
 
 def partial_path(path: Path) -> Path:
-    """Return a path beside `path` for the content while it is incomplete. No other process uses this path."""
+    """Return a new path in the folder of `path`, to write a file there first and to rename it when it is complete.
+
+    No other process uses the returned path.
+    """
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
 
 
 def write_file(path: Path, content: bytes | memoryview | str, durable: bool = False, keep: Path | None = None) -> None:
     """Write a file such that it is complete or absent. Raises InputError if it cannot be written.
 
-    `durable`: the file survives a power failure; this is slower. `keep`: if the file exists already, the old one is
-    moved to this path.
+    `content`: a text is written as UTF-8. `durable`: the file survives a power failure; this is slower. `keep`: an
+    existing file is moved to this path; None: it is replaced.
     """
     partial = partial_path(path)
     with writing(path):
@@ -87,9 +90,10 @@ def write_file(path: Path, content: bytes | memoryview | str, durable: bool = Fa
 
 
 def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
-    """Write a dictionary by `torch.save`, with a checksum. `read_state` detects damage by this checksum.
+    """Write a dictionary by `torch.save`, with a checksum by which a reader detects damage.
 
-    `keep`: see `write_file`.
+    An entry "sealed": True says that there is a checksum. `keep`: an existing file is moved to this path; None: it is
+    replaced. The file survives a power failure. Raises InputError if it cannot be written.
     """
     buffer = io.BytesIO()
     torch.save(state | {"sealed": True}, buffer)
@@ -98,7 +102,10 @@ def write_state(state: dict, path: Path, keep: Path | None = None) -> None:
 
 
 def seal(archive: io.BytesIO) -> None:
-    """Add a comment to a zip file: the checksum of everything before the comment."""
+    """Append a checksum to a zip file, as its comment. It covers everything before it. `archive` is changed.
+
+    `archive`: the zip file, without a comment.
+    """
     end = archive.seek(-COMMENT - 2, os.SEEK_END)
     assert archive.read(len(END)) == END, "it has a comment already"
     archive.seek(end + COMMENT)
@@ -107,18 +114,21 @@ def seal(archive: io.BytesIO) -> None:
 
 
 def is_sealed(archive: bytes) -> bool:
-    """Return whether a zip file ends with the checksum of `seal`, and whether this checksum is right."""
+    """Return True if a zip file ends with a checksum of ours that is right. False means no checksum, or a damaged file.
+
+    `archive`: the bytes of the file.
+    """
     body = memoryview(archive)[: max(0, len(archive) - len(SEAL) - DIGEST)]
     return archive[len(body) :] == SEAL + fingerprint(body)
 
 
 def fingerprint(content: bytes | memoryview) -> bytes:
-    """Return the BLAKE2b checksum of `content`, as `DIGEST` hexadecimal digits."""
+    """Return the BLAKE2b checksum of `content` as 32 hexadecimal digits."""
     return hashlib.blake2b(content, digest_size=DIGEST // 2).hexdigest().encode()
 
 
 def digest(file: Path) -> str:
-    """Return a hash of the content of a file."""
+    """Return the BLAKE2b checksum of a file's content as 32 hexadecimal digits. Large files need little memory."""
     result = hashlib.blake2b(digest_size=16)
     with file.open("rb") as stream:
         while block := stream.read(2**20):
@@ -127,7 +137,7 @@ def digest(file: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file that we wrote. Returns None if the file does not exist or is damaged."""
+    """Return the content of a JSON file. Returns None if the file is missing or damaged."""
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -135,17 +145,21 @@ def read_json(path: Path) -> Any:
 
 
 def quoted(content: bytes) -> list[str]:
-    """Return the quoted strings of an XML file. Among them are the names of all files that it refers to."""
+    """Return all quoted strings in an XML file. Among them are the names of the files that it uses.
+
+    `content`: the bytes of the file.
+    """
     strings = re.findall(rb"\"([^\"<>\0\n]{1,500})\"|'([^'<>\0\n]{1,500})'", content)
     return [(double or single).decode(errors="replace") for double, single in strings]
 
 
 @contextlib.contextmanager
 def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[None]:
-    """Lock a folder, as a context manager.
+    """A context manager that locks a folder for this process. The lock ends with the context or with the process.
 
-    If another process has locked it, raises InputError. With `wait`, it waits instead. The lock is a file beside the
-    folder, so that the folder can be moved. The lock ends with the process.
+    If another process has locked the folder, raises InputError; with `wait`, waits for that process instead. `field`:
+    name of the option that gave the folder, for messages. The lock is a file beside the folder, so the folder can be
+    moved.
     """
     place = folder.resolve()
     file = place.with_name(f".{place.name}.lock")
@@ -175,10 +189,10 @@ def locked(folder: Path, field: str = "--out", wait: bool = False) -> Iterator[N
 
 @contextlib.contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """A context manager that gives a temporary folder. At the end, it renames this folder to `folder`.
+    """A context manager that yields a new temporary folder. At the end, it renames this folder to `folder`.
 
-    `folder` must then be missing or empty. After an error, the temporary folder is removed. Raises InputError if
-    something cannot be written.
+    At that time, `folder` must be missing or empty. After an error, the temporary folder is removed, and `folder` stays
+    as it was. Raises InputError if something cannot be written.
     """
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -10,8 +10,8 @@ OWN = "MI_RING_OWN_GPU"  #: environment variable: 1 if no other process of the s
 def choose_gpu() -> None:
     """Let this process see only one GPU, if `torchrun` started several processes on this machine.
 
-    The rank of the process chooses the GPU. This is done only for the commands of mi_ring, not for other programs that
-    import mi_ring.
+    The process with local rank n gets GPU n, counted again from 0 if there are fewer GPUs. Does nothing in other
+    programs that import mi_ring. Sets environment variables.
     """
     if not any(word in ("mi_ring", "mi_ring.fit") or Path(word).stem == "mi-ring" for word in sys.orig_argv):
         return

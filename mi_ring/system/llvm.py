@@ -36,9 +36,10 @@ _too_late = False  # Dr.Jit was imported before `prepare`
 
 
 def prepare() -> None:
-    """Choose the LLVM of Dr.Jit by the environment variable `DRJIT_LIBLLVM_PATH`. Call it before Dr.Jit is imported.
+    """Choose the LLVM library for Dr.Jit. Sets the environment variable `DRJIT_LIBLLVM_PATH`.
 
-    If the user has set the variable, it is kept. If no library is usable, it is not set; see `missing`.
+    Call it before Dr.Jit is imported; later, it does nothing. A value that the user has set is kept. If no library is
+    usable, the variable stays unset.
     """
     global _too_late
     _too_late = "drjit" in sys.modules
@@ -50,9 +51,9 @@ def prepare() -> None:
 
 
 def missing() -> str | None:
-    """Return None if Mitsuba's variants `llvm_*` can run. Otherwise return what this machine lacks, and advice.
+    """Return what Mitsuba's variants `llvm_*` lack on this machine, with advice; None if they can run.
 
-    Call it after `prepare`. Without libatomic, Dr.Jit cannot be imported.
+    Call it after `prepare`.
     """
     if not has_atomic():
         return f"Dr.Jit needs libatomic.so.1, which this machine lacks. {cure('libatomic1')}"
@@ -84,9 +85,9 @@ def missing() -> str | None:
 
 
 def cure(package: str, more: str = "") -> str:
-    """Return a sentence that says how to install the library of a Debian package on this machine.
+    """Return a sentence that tells the user how to install a library on this machine.
 
-    It ends with `more`.
+    `package`: name of its Debian package. `more`: another remedy, appended to the sentence, for example ", or set …".
     """
     installers = {"darwin": "brew install llvm", "win32": "winget install LLVM.LLVM"}
     if sys.platform in installers:
@@ -96,9 +97,9 @@ def cure(package: str, more: str = "") -> str:
 
 
 def libraries(folders: list[str] | None = None) -> list[tuple[int, str]]:
-    """Return the LLVM libraries in `folders` (glob patterns) as (major version, path), the newest first.
+    """List the LLVM libraries in `folders` (glob patterns) as (major version, path), the newest first. Loads no file.
 
-    Default: those of the system, then the private copy. The version comes from the file name. No file is loaded.
+    None: the folders of the system, and after their libraries those of our private copy. Versions come from file names.
     """
     if folders is None:
         return libraries(_system_folders()) + libraries([f"{glob.escape(str(PRIVATE))}/**"])
@@ -124,7 +125,10 @@ def _system_folders() -> list[str]:
 
 
 def find(folders: list[str] | None = None) -> str | None:
-    """Return the first of `libraries(folders)` that is new enough and can be loaded. Returns None if there is none."""
+    """Return the path of the newest LLVM library that Dr.Jit can use, or None. Loads the library.
+
+    `folders`: glob patterns of folders to search; None: those of the system first, then our private copy.
+    """
     if sys.platform == "win32" and folders is None:  # file names there do not contain the version
         places = shutil.which("LLVM-C.dll"), r"C:\Program Files\LLVM\bin\LLVM-C.dll"
         return next((path for path in places if path and os.path.exists(path)), None)
@@ -132,7 +136,7 @@ def find(folders: list[str] | None = None) -> str | None:
 
 
 def loads(path: str | Path) -> bool:
-    """Load a shared library for the rest of the process. Returns False if this fails, e.g. for another architecture."""
+    """Load a shared library into this process. Returns False if this fails, e.g. for another architecture."""
     try:
         ctypes.CDLL(str(path))
         return True
@@ -141,14 +145,14 @@ def loads(path: str | Path) -> bool:
 
 
 def has_atomic() -> bool:
-    """Return whether libatomic can be loaded. Dr.Jit needs it on Linux. Small containers do not have it."""
+    """Return True if Dr.Jit finds libatomic, which it needs on Linux. Small containers do not have it."""
     return sys.platform != "linux" or loads("libatomic.so.1")
 
 
 def preload(folder: Path) -> None:
-    """Load the shared libraries in `folder`, except LLVM. The dependencies of a library are loaded before it.
+    """Load the shared libraries in `folder` and its subfolders into this process, except LLVM.
 
-    The dynamic loader does not search this folder, but it accepts libraries that are already loaded.
+    The dynamic loader does not search this folder. But a library that needs them then finds them, as they are loaded.
     """
     waiting = [path for path in folder.rglob("*.so*") if path.is_file() and not path.name.startswith("libLLVM")]
     while waiting != (left := [path for path in waiting if not loads(path)]):
@@ -156,9 +160,9 @@ def preload(folder: Path) -> None:
 
 
 def install(target: Path = PRIVATE) -> str:
-    """Make LLVM and libatomic available. Returns a line that says where they are.
+    """Download LLVM and libatomic if this machine lacks them. Returns a text for the user that says where LLVM is.
 
-    If one of them is missing, packages are unpacked into the folder `target`. Raises RuntimeError if this fails.
+    They are unpacked into the folder `target`. Raises RuntimeError if this fails.
     """
     preload(target)
     path, packages = os.environ.get(VARIABLE) or find(), []
@@ -175,12 +179,12 @@ def install(target: Path = PRIVATE) -> str:
 
 
 def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
-    """Unpack Debian or Ubuntu packages into the folder `target`. Returns the names of the packages.
+    """Download Debian or Ubuntu packages, and unpack them into the folder `target`. Returns their names.
 
-    `target` is replaced. After an error, it is as before or absent, never incomplete. `alternatives`: lists of
-    packages. The first list that the archive has is used, with its dependencies. Packages that are installed are left
-    out. No root rights are needed, because apt's lists and cache are in a temporary folder. Raises RuntimeError if
-    there is no apt or if it fails.
+    `alternatives`: lists of package names; the first list that the archive has is used, with its dependencies, without
+    packages that are installed already. `target` is replaced; after an error, it is as before or missing, never
+    incomplete. Needs no root rights, because apt's lists and cache are in a temporary folder. Raises RuntimeError if
+    there is no apt or if apt fails.
     """
     if not shutil.which("apt-get"):
         raise RuntimeError(
@@ -222,7 +226,7 @@ def unpack(alternatives: list[list[str]], target: Path) -> list[str]:
 
 
 def main(arguments: list[str]) -> None:
-    """`llvm.py` makes LLVM available; `llvm.py FOLDER PACKAGE...` unpacks other packages into a folder."""
+    """Run the script: without arguments, make LLVM available; with FOLDER PACKAGE..., unpack packages into a folder."""
     try:
         if arguments:
             unpack([arguments[1:]], Path(arguments[0]))

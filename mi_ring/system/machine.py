@@ -28,12 +28,12 @@ LARGE_ARRAY = 2**25  #: bytes from which freed arrays go back to the system; the
 
 
 def device() -> torch.device:
-    """Return the device on which the current variant of Mitsuba computes. Tensors on it need not be copied."""
+    """Return the device on which the current variant of Mitsuba computes: the CPU or the current CUDA device."""
     return torch.device("cuda" if str(mi.variant()).startswith("cuda") else "cpu")
 
 
 def has_fast_bfloat16(device: torch.device) -> bool:
-    """Return whether matrix products are faster in bfloat16 than in float32. Most processors only emulate bfloat16.
+    """Return True if matrix products are faster in bfloat16 than in float32. Most processors only emulate bfloat16.
 
     The features of the processor decide this. Nothing is measured, so that a fit can be repeated exactly.
     """
@@ -52,9 +52,10 @@ def has_fast_bfloat16(device: torch.device) -> bool:
 
 
 def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.AbstractContextManager]:
-    """Return a function that makes a context manager for matrix products in this `precision`.
+    """Return a function that makes a context manager in which torch computes matrix products in this precision.
 
-    `auto`: the faster one of float32 and bfloat16.
+    `precision`: "float32", "bfloat16", or "auto" for the faster one of both on `device`. The function takes no
+    arguments.
     """
     if precision == "bfloat16" or (precision == "auto" and has_fast_bfloat16(device)):
         return lambda: torch.autocast(device.type, torch.bfloat16)
@@ -64,8 +65,8 @@ def autocast(precision: str, device: torch.device) -> Callable[[], contextlib.Ab
 def set_variant(variant: str) -> str:
     """Switch Mitsuba to a variant. Returns the name of the variant that is then set.
 
-    Without a usable GPU, a CUDA variant is replaced by `llvm_ad_rgb`, and a message is printed. Raises InputError if
-    the variant needs LLVM and there is none.
+    If there is no usable GPU, a variant `cuda_*` is replaced by `llvm_ad_rgb`, and a message is printed. Raises
+    InputError if the variant needs LLVM and LLVM is missing.
     """
     reason = None
     if variant.startswith("cuda"):
@@ -89,16 +90,17 @@ def set_variant(variant: str) -> str:
 
 
 def cores() -> int:
-    """Return the number of processor cores that this process may use, by its affinity and its container's quota."""
+    """Return the number of processor cores that this process may use, by its CPU affinity and container quota."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux
     count = len(affinity(0)) if affinity else os.cpu_count() or 1
     return max(1, math.ceil(min(count, cpu_quota(Path("/sys/fs/cgroup")))))
 
 
 def in_threads(function: Callable[..., Result], *things: Iterable, most: int | None = None) -> Iterator[Result]:
-    """Call `function` like `map`, but in threads: one per core, and at most `most`. Yields the results in order.
+    """Call `function` on the elements of iterables like `map`, but in threads. Yields the results in input order.
 
-    It is of use only if `function` releases Python's global lock.
+    `things`: an iterable for each argument. `most`: largest number of threads; None: one per core. This is faster only
+    if `function` releases Python's global interpreter lock.
     """
     with ThreadPoolExecutor(min(cores(), most or cores())) as pool:
         yield from pool.map(function, *things)
@@ -107,10 +109,11 @@ def in_threads(function: Callable[..., Result], *things: Iterable, most: int | N
 def pipelined(
     first: Callable[[Thing], Part], second: Callable[[Thing, Part], Result], things: Iterable[Thing]
 ) -> Iterator[Result]:
-    """Yield `second(thing, first(thing))` for each thing.
+    """Yield `second(thing, first(thing))` for each of `things`, in the same order.
 
-    `second` runs in another thread, at the same time as `first` of the next thing. But if Dr.Jit has one thread, both
-    run in this thread, because `exr_threads` must not change the number during rendering.
+    While `second` runs in another thread, `first` already works on the next thing. But if Dr.Jit has only one thread,
+    both run one after the other, because reading an EXR file in `second` must not change that number while `first`
+    renders.
     """
     if dr.thread_count() < EXR_THREADS:
         for thing in things:
@@ -128,7 +131,7 @@ def pipelined(
 
 
 def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Make a long native call in another thread. Returns its result. Ctrl-C then works at once."""
+    """Call `call` with these arguments in another thread, and return its result. So Ctrl-C stops the wait at once."""
     future = ThreadPoolExecutor(1).submit(call, *arguments, **options)
     while not wait([future], 0.1).done:
         pass
@@ -136,9 +139,9 @@ def interruptible(call: Callable[..., Result], *arguments: Any, **options: Any) 
 
 
 def cpu_quota(root: Path) -> float:
-    """Return the number of cores that the control groups below `root` allow this process.
+    """Return how many cores the Linux control groups allow this process; infinite without a limit.
 
-    Without a limit, the number is infinite. Parent groups limit it, too:
+    `root`: folder of the control groups, usually /sys/fs/cgroup. Limits of parent groups count, too:
     https://docs.kernel.org/admin-guide/cgroup-v2.html
     """
     groups = [root]
@@ -157,15 +160,15 @@ def cpu_quota(root: Path) -> float:
 
 
 def set_threads(count: int = 0) -> None:
-    """Set the number of threads of torch and Dr.Jit. 0: as many as `cores`."""
+    """Set the number of threads of torch and Dr.Jit. 0: one for each core that this process may use."""
     torch.set_num_threads(count or cores())
     dr.set_thread_count(count or cores())
 
 
 def computer() -> str:
-    """Return a text with the model of the processor and the number of `cores`, for reports.
+    """Return a text for reports: the model of the processor, and the number of cores that this process may use.
 
-    If the current variant uses a GPU, the text begins with the name of the GPU.
+    If the current variant of Mitsuba uses a GPU, the text begins with the name of the GPU.
     """
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -178,9 +181,9 @@ def computer() -> str:
 
 @contextlib.contextmanager
 def threads_of(count: int = 0) -> Iterator[None]:
-    """A context manager in which torch and Dr.Jit use `count` threads. 0: as many as `cores`.
+    """A context manager in which torch and Dr.Jit use `count` threads. 0: one for each core.
 
-    Only one thread gives exactly the same results each time. With more threads, the order of sums varies.
+    With one thread, results can be repeated exactly. With more threads, the order of sums varies.
     """
     before = torch.get_num_threads(), dr.thread_count()
     set_threads(count)
@@ -193,7 +196,10 @@ def threads_of(count: int = 0) -> Iterator[None]:
 
 @contextlib.contextmanager
 def exr_threads() -> Iterator[None]:
-    """A context manager in which Dr.Jit has at least `EXR_THREADS` threads. Use it to read or write an EXR."""
+    """A context manager for reading or writing an EXR file: in it, Dr.Jit has at least `EXR_THREADS` threads.
+
+    Rendering in another thread must not run at the same time.
+    """
     with _exr_lock:  # another thread may have raised the number for a moment
         before = dr.thread_count()
     if before >= EXR_THREADS:
@@ -208,7 +214,7 @@ def exr_threads() -> Iterator[None]:
 
 
 def glibc(name: str) -> Callable[..., int]:
-    """Return a function of glibc. On other systems (macOS, musl, Windows), returns a function that does nothing."""
+    """Return a function of glibc by its name. On other systems (macOS, musl, Windows), it does nothing."""
     try:
         return getattr(ctypes.CDLL(None), name)
     except (AttributeError, TypeError, OSError):
@@ -216,9 +222,9 @@ def glibc(name: str) -> Callable[..., int]:
 
 
 def keep_memory() -> None:
-    """Tell glibc to keep the memory of freed arrays, because new pages from the system are slow.
+    """Tell glibc to keep the memory of freed arrays for new ones, because new pages from the system are slow.
 
-    Arrays of `LARGE_ARRAY` bytes or more are still given back.
+    Arrays of `LARGE_ARRAY` bytes or more still go back to the system.
     """
     mallopt = glibc("mallopt")
     mallopt(M_MMAP_THRESHOLD, LARGE_ARRAY)
@@ -226,6 +232,6 @@ def keep_memory() -> None:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system. This may be half of the memory of a fit."""
+    """Return freed memory to the system. This can be half of the memory that a fit uses."""
     dr.flush_malloc_cache()
     glibc("malloc_trim")(0)

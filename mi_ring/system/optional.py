@@ -1,4 +1,4 @@
-"""Imports packages that are not available for every machine. They are imported only when they are needed."""
+"""Imports optional packages, which some machines lack. Each is imported only when it is needed."""
 
 import contextlib
 import importlib.util
@@ -12,14 +12,15 @@ from mi_ring.errors import InputError
 
 
 def installed(package: str) -> bool:
-    """Return whether this package can be imported."""
+    """Return True if this package is installed. Does not import it."""
     return importlib.util.find_spec(package) is not None
 
 
 def need(package: str, what: str, distribution: str | None = None) -> ModuleType:
-    """Import a package, and return it. Raises InputError if it is not installed.
+    """Import a package and return it. Raises InputError if it is not installed.
 
-    The message begins with `what`, which says what needs the package. `distribution`: the name for pip, if it differs.
+    `what`: what needs the package, the beginning of the message. `distribution`: the package's name for pip; None: the
+    same name.
     """
     try:
         with keeping_handlers():  # pycolmap installs its own
@@ -43,7 +44,10 @@ def keeping_handlers() -> Iterator[None]:
 
 
 class LazyPackage:
-    """Stands for a package. When it is first used, `need` imports the package."""
+    """Stands for a package that is imported when an attribute is first read. Then raises InputError if it is missing.
+
+    `what`: what needs the package, the beginning of the message.
+    """
 
     def __init__(self, package: str, what: str) -> None:
         self.package, self.what = package, what

@@ -18,7 +18,10 @@ DELAY, LOG_INTERVAL = 2.0, 30.0  #: seconds before the first line in a log, and 
 
 @contextlib.contextmanager
 def tolerating_closed_output() -> Iterator[None]:
-    """A context manager that drops output that cannot be written, such as after `| head` or in a closed terminal."""
+    """A context manager in which output that cannot be written is dropped, as after `| head` or in a closed terminal.
+
+    It replaces `sys.stdout` and `sys.stderr`.
+    """
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (stream and TolerantStream(stream) for stream in before)  # None: there is no console
     try:
@@ -34,7 +37,7 @@ def tolerating_closed_output() -> Iterator[None]:
 
 
 class TolerantStream:
-    """A text stream that drops text that cannot be written. Once its reader is gone, it drops all text."""
+    """A text stream that ignores errors of writing. If its reader is gone (`head`), it drops all further text."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -43,16 +46,16 @@ class TolerantStream:
         return getattr(self.stream, name)
 
     def write(self, text: str) -> int:
-        """Write text if this is possible. Returns the length of the text in any case."""
+        """Write text, and ignore an OSError. Returns the length of the text in both cases."""
         self.attempt(self.stream.write, text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush the stream if this is possible."""
+        """Flush the stream, and ignore an OSError."""
         self.attempt(self.stream.flush)
 
     def attempt(self, operation: Callable[..., object], *arguments: Any) -> None:
-        """Call an operation of the stream, and ignore its OSError."""
+        """Call `operation` with `arguments`, and ignore an OSError. If the reader is gone, drop all further text."""
         try:
             operation(*arguments)
         except OSError as error:
@@ -60,26 +63,26 @@ class TolerantStream:
                 self.discard()
 
     def discard(self) -> None:
-        """Send the buffered text, and all text that follows, to the null device.
+        """Redirect the stream to the null device: the text that is still in its buffer, and all text that follows.
 
-        Otherwise, writing the buffered text would fail again at exit.
+        Otherwise, writing the buffered text would fail again when the process exits.
         """
         with contextlib.suppress(OSError), open(os.devnull, "w") as null:
             os.dup2(null.fileno(), self.stream.fileno())
 
 
 class LogBar(tqdm):
-    """A progress bar for a log. It writes a line every `LOG_INTERVAL` seconds, and one at the end."""
+    """A progress bar for a log file. It writes a line every `LOG_INTERVAL` seconds, and one at the end."""
 
     written, line = -math.inf, ""  #: when the last line was written [s], and its text
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
-        """Write a line if `LOG_INTERVAL` is over. tqdm calls this method."""
+        """Write a line if the last one is at least `LOG_INTERVAL` seconds old. tqdm calls this method."""
         if msg is None and time.monotonic() - self.written >= LOG_INTERVAL:
             self.write_line()
 
     def write_line(self) -> None:
-        """Write the progress as a line. If the last line is the same, nothing is written."""
+        """Write the progress as a line, unless the line is the same as the last one."""
         if (line := str(self).strip()) != self.line:
             self.fp.write(f"{line}\n")
             self.fp.flush()
@@ -89,21 +92,21 @@ class LogBar(tqdm):
         """Do nothing. tqdm calls this method to erase a bar, but a log is not erased."""
 
     def close(self) -> None:
-        """Write a last line, if lines were written before."""
+        """Close the bar. If it has written lines, write a last one."""
         if not self.disable and self.line:
             self.write_line()
         super().close()
 
 
 class Step(NamedTuple):
-    """A step of a command, for progress bars: the names of its bars, and how long it takes."""
+    """A step of a command: the progress bars that belong to it, and how long it is likely to take."""
 
     bars: tuple[str, ...]  #: what the names of its progress bars begin with
     seconds: float  #: that it is likely to take; only the ratios of steps matter
 
 
 class Steps:
-    """The steps of a command, as a context manager. Progress bars then show the step and the time that is left."""
+    """The steps of a command, as a context manager. In it, progress bars show the step and the time that is left."""
 
     current: ClassVar["Steps | None"] = None  #: those of the command that runs
 
@@ -118,9 +121,10 @@ class Steps:
         Steps.current = None
 
     def named(self, what: str) -> str:
-        """Return the name for a progress bar, with its step and the time that all steps still need.
+        """Return the text for a progress bar: its name `what` with the number of its step and the time still needed.
 
-        If the bar belongs to no step, or to a step that is over, its name does not change. `what`: the bar's name.
+        The time is that of all steps that are left. If no step that is left has a bar of this name, returns `what`
+        unchanged.
         """
         ahead = range(self.number, len(self.steps))
         found = next((n for n in ahead if what.startswith(self.steps[n].bars)), None)
@@ -137,9 +141,11 @@ class Steps:
 def progress(
     things: Iterable | None, what: str = "", total: float | None = None, leave: bool = False, **options: Any
 ) -> tqdm:
-    """Iterate over `things`, and show the progress. `what`: name of the bar. `options`: those of tqdm.
+    """Return an iterator over `things` that shows a progress bar; for None, call its `update` yourself.
 
-    In a terminal, it is a bar. In a log, it is a line every 30 seconds. Work of less than two seconds gets no line.
+    `what`: name of the bar. `total`: number of things, if `len` cannot tell it. `leave`: the bar stays when it is
+    finished. `options`: other options of tqdm. If standard error is not a terminal, it writes a line every 30 seconds,
+    and none if the work takes less than two seconds.
     """
     kind, what = tqdm, Steps.current.named(what) if Steps.current else what
     if not getattr(sys.stderr, "isatty", bool)():
