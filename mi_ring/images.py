@@ -1,4 +1,4 @@
-"""Images as arrays: the sRGB curve, filters, and functions that read and write image files of any bit depth."""
+"""Images as arrays: encoding as sRGB, filters, and functions that read and write image files of any bit depth."""
 
 import contextlib
 import io
@@ -15,7 +15,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.colour_profiles import as_stated
-from mi_ring.colour_profiles import srgb_to_linear as srgb_to_linear  # beside its inverse for those who read images
 from mi_ring.foreign import require_plausible_size
 from mi_ring.image_headers import (
     RAW,

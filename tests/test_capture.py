@@ -15,6 +15,7 @@ from mi_ring import images
 from mi_ring.capture import decoding, loading, observation
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import fitted_scene_xml
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.fitting.checkpoint import digests
 from mi_ring.fitting.config import Config
@@ -44,7 +45,7 @@ def test_sixteen_bits_are_linear_and_all_of_them_count():
 
 def test_srgb_encoding_inverts_decoding():
     v = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(images.srgb_to_linear(images.linear_to_srgb(v)), v, atol=1e-5)
+    np.testing.assert_allclose(srgb_to_linear(images.linear_to_srgb(v)), v, atol=1e-5)
 
 
 def test_sixteen_bit_files_are_read_with_all_bits(broken_capture):
@@ -148,7 +149,7 @@ def test_declared_encoding_beats_the_default(broken_capture):
     for k in (1, 2):
         mi.Bitmap(pixels).write(str(path.parent / f"images/{k:03}.png"))
     scene = loading.load_capture(path)
-    for k, convert in ((1, images.srgb_to_linear), (2, np.float32)):
+    for k, convert in ((1, srgb_to_linear), (2, np.float32)):
         np.testing.assert_allclose(scene.observe([k])[0][0].numpy(), convert(pixels / 65535.0), atol=1e-6)
 
 

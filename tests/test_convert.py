@@ -27,8 +27,9 @@ from helpers.foreign_captures import (
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from mi_ring import convert, foreign, images
+from mi_ring import convert, foreign
 from mi_ring.capture import loading
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.importers import colmap as importer
 from mi_ring.rendering.pinhole import Pinhole
@@ -136,7 +137,7 @@ def test_transforms_of_nerf(tmp_path):
     inside = disc()[..., 0] > 0
     assert masked.all() and (mask[0].numpy() == inside).all()
     assert not rgb[0].numpy()[~inside].any()  # what is transparent is black
-    expected = images.srgb_to_linear(noise(np.uint8, 4, seed=1)[..., :3] / np.float32(255))
+    expected = srgb_to_linear(noise(np.uint8, 4, seed=1)[..., :3] / np.float32(255))
     np.testing.assert_allclose(rgb[0].numpy()[inside], expected[inside], atol=1e-6)
 
 

@@ -15,7 +15,7 @@ from helpers.foreign_captures import colmap_folder, converted, disc, noise, tran
 from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from mi_ring import convert, image_fields, image_headers, images
-from mi_ring.colour_profiles import Statement, as_stated, primaries_profile
+from mi_ring.colour_profiles import Statement, as_stated, primaries_profile, srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.importers.photogrammetry import exposures_of
 from mi_ring.importers.reading import has_alpha, pixels_of
@@ -322,7 +322,7 @@ def test_primaries_of_openexr(tmp_path):
 ])  # fmt: skip
 def test_colours_that_are_said_without_a_profile(tmp_path, write, close):
     """Display P3 by the codes of H.273, and Adobe RGB by EXIF, are converted by numpy here."""
-    primaries, curve = P3, images.srgb_to_linear
+    primaries, curve = P3, srgb_to_linear
     encoded = images.linear_to_srgb(stripes())
     write(tmp_path / "a", stripes())
     file = next(tmp_path.iterdir())

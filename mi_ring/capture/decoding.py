@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import LARGEST, InputError, is_file
 from mi_ring.foreign import reading
 from mi_ring.image_headers import image_size
-from mi_ring.images import contrasted, linear_to_srgb, mask_values, read_image, srgb_to_linear
+from mi_ring.images import contrasted, linear_to_srgb, mask_values, read_image
 from mi_ring.scene.shot import Encoding, Shot
 
 

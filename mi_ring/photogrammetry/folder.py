@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image
 
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.image_headers import HEIF, KINDS, RAW, SUFFIXES, encoding_of, exif_of, open_image
-from mi_ring.images import linear_to_srgb, mask_values, orientation_axes, oriented, read_image, srgb_to_linear
+from mi_ring.images import linear_to_srgb, mask_values, orientation_axes, oriented, read_image
 from mi_ring.importers.named_photographs import MASK_AFFIX
 from mi_ring.importers.photogrammetry import exposures_of
 from mi_ring.importers.reading import image_size, read_as
