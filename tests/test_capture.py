@@ -1,5 +1,6 @@
 """Scenes to tensors: decoding, masks, the normalising sphere, and one clear line for what is wrong."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -139,6 +140,20 @@ def test_a_shape_needs_no_id(broken_capture):
     edit(' id="object"', "")
     scene = loading.load_capture(path)
     Surface(scene.scene, scene.shape)
+
+
+def test_a_rotation_of_nine_numbers_may_have_its_place_beside_it(broken_capture):
+    path, _ = broken_capture
+    before = [shot.camera.to_world for shot in loading.load_capture(path, images=False).shots]
+
+    def split(match):
+        m = np.array(match[1].split(), float).reshape(4, 4)
+        return '<matrix value="{} {} {}  {} {} {}  {} {} {}"/><translate x="{}" y="{}" z="{}"/>'.format(
+            *m[:3, :3].ravel(), *m[:3, 3])  # fmt: skip
+
+    path.write_text(re.sub('<matrix value="([^"]*)"/>', split, path.read_text()))
+    after = [shot.camera.to_world for shot in loading.load_capture(path, images=False).shots]
+    np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-5)
 
 
 def test_declared_encoding_beats_the_default(broken_capture):

@@ -154,4 +154,4 @@ def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
     if itself and pixels.shape[2] not in (2, 4):
         raise InputError(f'{file}: photograph "{shot.name}", {field}: is the photograph itself, which has no '
                          "alpha channel")  # fmt: skip
-    return mask_values(pixels[:, :, -1:] if itself else pixels)
+    return mask_values(pixels[:, :, -1:] if itself else pixels, f'{file}: photograph "{shot.name}", {field}')

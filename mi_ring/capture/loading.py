@@ -1,6 +1,7 @@
 """Reads scene files, and raises an InputError for anything that cannot be fitted."""
 
 import math
+import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import replace
@@ -136,7 +137,7 @@ def require_scene(path: Path) -> None:
 def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
     """Load a scene file. Returns (scene, its photographs).
 
-    Raises InputError if the file cannot be read, or if it has no photographs.
+    Raises InputError if the file cannot be read, if it has no photographs, or if two of them have the same image file.
     """
     require_scene(path)
     try:
@@ -153,6 +154,11 @@ def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
         raise InputError(f"{path}: {error}") from error
     if not shots:
         raise InputError(f'{path}: sensor: found no <sensor type="photograph">; one per photograph is needed')
+    known: dict[str, Shot] = {}
+    for shot in shots:
+        if (other := known.setdefault(os.path.realpath(str(shot.files.filename)), shot)) is not shot:
+            raise InputError(f'{path}: photographs "{other.name}" and "{shot.name}": filename: both are '
+                             f"{shot.files.filename}; give each its own, or remove one")  # fmt: skip
     return scene, shots
 
 
@@ -164,9 +170,9 @@ def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
 def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
     """Raise InputError if the XML is invalid, or if a photograph or its light has no place.
 
-    Without a place, Mitsuba would use the origin. It ignores the last row of a matrix: this row must be 0 0 0 1. Files
-    that the scene includes are checked, too. `above`: the files that include this one. Raises UnicodeDecodeError if the
-    file is not UTF-8.
+    Without a place, Mitsuba would use the origin, also if a matrix has 9 numbers, a rotation. It ignores the last row
+    of a matrix: this row must be 0 0 0 1. Files that the scene includes are checked, too. `above`: the files that
+    include this one. Raises UnicodeDecodeError if the file is not UTF-8.
     """
     content = path.read_bytes()
     content.decode("utf-8")
@@ -179,8 +185,13 @@ def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
         name = f'{path}: photograph "{sensor.get("id", "")}"'
         if sensor.find("*[@name='to_world']") is None:
             raise InputError(f"{name}: to_world is missing; give the pose of its camera")
+        parts = {element.tag for element in sensor.iterfind("transform/*")}
         for element in sensor.iterfind("transform/matrix"):
-            row = element.get("value", "").replace(",", " ").split()[12:]
+            words = element.get("value", "").replace(",", " ").split()
+            if len(words) == 9 and not parts & {"translate", "lookat"}:  # Mitsuba puts it at the origin
+                raise InputError(f"{name}: to_world: its matrix has 9 numbers, a rotation without a place; give 16, "
+                                 "the last four 0 0 0 1, or a <translate> after it")  # fmt: skip
+            row = words[12:]
             if len(row) == 4 and not is_affine(row):
                 raise InputError(f"{name}: to_world: the last row of its matrix is {' '.join(row)}, must be 0 0 0 1; "
                                  "is it transposed?")  # fmt: skip

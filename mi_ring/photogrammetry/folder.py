@@ -48,7 +48,7 @@ class Picture:
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """Pixels (H, W, C) uint8 or uint16. They are turned upright if `upright` is set. See also `encoding`.
+        """Pixels (H, W, 3 or 4) uint8 or uint16. They are turned upright if `upright` is set. See also `encoding`.
 
         Floats become uint16: 1 is full scale, and larger values are clipped. Raises InputError if the file cannot be
         read.
@@ -62,12 +62,13 @@ class Picture:
             if not np.isfinite(pixels).all():
                 raise InputError(f"{self.path}: contains pixels that are NaN or infinite")
             pixels = (pixels.clip(0, 1) * 65535 + 0.5).astype(np.uint16)
-        return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
+        count = pixels.shape[2]
+        return pixels[:, :, [0, 0, 0, *range(1, count)]] if count < 3 else pixels  # grey, with alpha or without
 
     @property
     def mask_pixels(self) -> np.ndarray:
         """The file, read as a mask (H, W) uint8. It is turned in the same way as `pixels`."""
-        return oriented(mask_values(read_as(self.path, "mask", read_image)), self.orientation)
+        return oriented(mask_values(read_as(self.path, "mask", read_image), f"{self.path}: mask"), self.orientation)
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
         """Open the file, and return the result of `read(opened)`.
