@@ -158,7 +158,7 @@ def test_photographs_of_fewer_bits_in_files_of_sixteen(broken_capture, tmp_path,
         assert status == 1 and len(found) == 1 and re.search(f"Problem: the largest value .* {words}", found[0]), text
     else:
         assert not found, text
-    clipped = [float(line.split()[6].rstrip("%")) for line in text.splitlines() if re.match(r" *\d{3}.png", line)]
+    clipped = [float(line.split()[5].rstrip("%")) for line in text.splitlines() if re.match(r" *\d{3}.png", line)]
     assert len(clipped) == 12 and (max(clipped) > 1) == (words is None)
 
 
