@@ -20,7 +20,8 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, shift
 from scipy.optimize import minimize
 
-from mi_ring.images import linear_to_srgb, srgb_to_linear
+from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.images import linear_to_srgb
 
 BLURS = 1, 2, 4, 8, 16, 32  #: [px]
 

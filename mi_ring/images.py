@@ -1,8 +1,9 @@
-"""Images as arrays: the sRGB curve, filters, and functions that read and write image files of any bit depth."""
+"""Images as arrays: encoding as sRGB, filters, and functions that read and write image files of any bit depth."""
 
 import contextlib
 import io
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.colour_profiles import as_stated
-from mi_ring.colour_profiles import srgb_to_linear as srgb_to_linear  # beside its inverse for those who read images
+from mi_ring.errors import InputError
 from mi_ring.foreign import require_plausible_size
 from mi_ring.image_headers import (
     RAW,
@@ -32,6 +33,9 @@ from mi_ring.system.files import write_file
 from mi_ring.system.machine import exr_threads
 from mi_ring.system.optional import need
 
+#: Full scale and bits of cameras whose values may be stored in the low bits of 16.
+LOW_BITS = {1023: 10, 4095: 12, 16383: 14}
+MAX_LABELS = 32  #: largest number of values in a mask of labels; more are a picture
 EXR_CHUNK = 256  #: rows of the largest chunk of an OpenEXR file; its reader allocates one for an image of one row, too
 
 Pictures = TypeVar("Pictures", np.ndarray, Tensor)
@@ -103,6 +107,20 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
     return as_stated(pixels, statement_of(path)) if heed else pixels
 
 
+def largest_value(pictures: Iterable[np.ndarray]) -> int:
+    """Return the largest colour value of pictures (H, W, C) uint16; 0 without pictures.
+
+    It tells whether they use all 16 bits: see `LOW_BITS`. Once a value needs more than 14 bits, no more pictures are
+    taken from the iterator.
+    """
+    largest = 0
+    for pixels in pictures:
+        largest = max(largest, int(pixels[..., : 3 if pixels.shape[2] > 2 else 1].max()))
+        if largest >= 2**14:
+            break
+    return largest
+
+
 def read_tiff(path: Path) -> np.ndarray:
     """Read the pixels (H, W, C) of the first page of a TIFF file; (H, W) if there is one channel.
 
@@ -163,11 +181,14 @@ def read_raw(path: Path) -> np.ndarray:
         return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0)
 
 
-def mask_values(pixels: np.ndarray) -> np.ndarray:
+def mask_values(pixels: np.ndarray, what: str) -> np.ndarray:
     """Convert the pixels (H, W, C) of a mask file to the mask (H, W) uint8, from 0 (background) to 255 (object).
 
     The mask is the alpha channel if it is not constant. Otherwise it is the colour channel that varies most, because
     the object may have any colour. If all values above 0 are equal, such as the label 1, they become 255.
+
+    Raises InputError if the values seem to be several labels: floats above 1, or a few values that are all dark. The
+    message begins with `what`.
     """
     count = pixels.shape[2]
     extent = np.ptp(pixels, (0, 1))
@@ -177,6 +198,11 @@ def mask_values(pixels: np.ndarray) -> np.ndarray:
     if 0 < shown.size < channel.size and shown.min() == shown.max():
         return np.where(channel > 0, np.uint8(255), np.uint8(0))
     full = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(pixels.dtype, 1)
+    largest = shown.max(initial=0)
+    if largest > full or (0 < largest < full / 2 and len(np.unique(shown)) <= MAX_LABELS):
+        labels = np.unique(channel)
+        listed = ", ".join(f"{label:g}" for label in labels[:6]) + ", …" * (len(labels) > 6)
+        raise InputError(f"{what}: has the values {listed}; save the object as {full}, and all else as 0")
     return (channel.astype(np.float32) * (255 / full)).round().astype(np.uint8)
 
 

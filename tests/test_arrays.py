@@ -123,7 +123,7 @@ WRONG = {
     "a mask alone": ({"masks": True}, "masks: is bool; must be a list"),
     "too many masks": ({"masks": [None, None]}, "masks: has 2 for 1 images"),
     "a turned mask": ({"masks": [np.ones((7, 5), bool)]}, r"masks\[0\]: is bool of shape \(7, 5\); must be \(5, 7\)"),
-    "a mask of ones": ({"masks": [np.ones((5, 7), np.uint8)]}, r"masks\[0\]: has 1 inside"),
+    "a mask of ones": ({"masks": [np.ones((5, 7), np.uint8)]}, r"masks\[0\]: has the values 1; save"),
     "no camera": ({"cameras": []}, "cameras: has 0 for 1 images"),
     "a matrix": ({"cameras": [np.eye(4)]}, r"cameras\[0\]: is ndarray; must be a mi_ring.Camera"),
     "a size": ({"cameras": [CAMERA._replace(size=(5, 7))]}, r"cameras\[0\]: size is \(5, 7\).*its image is 7 x 5"),

@@ -1,5 +1,6 @@
 """Scenes to tensors: decoding, masks, the normalising sphere, and one clear line for what is wrong."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from mi_ring import images
 from mi_ring.capture import decoding, loading, observation
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import fitted_scene_xml
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.fitting.checkpoint import digests
 from mi_ring.fitting.config import Config
@@ -44,7 +46,7 @@ def test_sixteen_bits_are_linear_and_all_of_them_count():
 
 def test_srgb_encoding_inverts_decoding():
     v = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(images.srgb_to_linear(images.linear_to_srgb(v)), v, atol=1e-5)
+    np.testing.assert_allclose(srgb_to_linear(images.linear_to_srgb(v)), v, atol=1e-5)
 
 
 def test_sixteen_bit_files_are_read_with_all_bits(broken_capture):
@@ -140,6 +142,20 @@ def test_a_shape_needs_no_id(broken_capture):
     Surface(scene.scene, scene.shape)
 
 
+def test_a_rotation_of_nine_numbers_may_have_its_place_beside_it(broken_capture):
+    path, _ = broken_capture
+    before = [shot.camera.to_world for shot in loading.load_capture(path, images=False).shots]
+
+    def split(match):
+        m = np.array(match[1].split(), float).reshape(4, 4)
+        return '<matrix value="{} {} {}  {} {} {}  {} {} {}"/><translate x="{}" y="{}" z="{}"/>'.format(
+            *m[:3, :3].ravel(), *m[:3, 3])  # fmt: skip
+
+    path.write_text(re.sub('<matrix value="([^"]*)"/>', split, path.read_text()))
+    after = [shot.camera.to_world for shot in loading.load_capture(path, images=False).shots]
+    np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-5)
+
+
 def test_declared_encoding_beats_the_default(broken_capture):
     path, edit = broken_capture
     edit('<string name="filename" value="images/001.png"/>',
@@ -148,7 +164,7 @@ def test_declared_encoding_beats_the_default(broken_capture):
     for k in (1, 2):
         mi.Bitmap(pixels).write(str(path.parent / f"images/{k:03}.png"))
     scene = loading.load_capture(path)
-    for k, convert in ((1, images.srgb_to_linear), (2, np.float32)):
+    for k, convert in ((1, srgb_to_linear), (2, np.float32)):
         np.testing.assert_allclose(scene.observe([k])[0][0].numpy(), convert(pixels / 65535.0), atol=1e-6)
 
 

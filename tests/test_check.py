@@ -9,6 +9,9 @@ from helpers.silhouettes import ball, silhouettes
 from PIL import Image
 
 from mi_ring import check
+from mi_ring.capture.loading import load_capture
+from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.errors import InputError
 from mi_ring.geometry import hull
 from mi_ring.metrics import capture_findings, mask_agreement
 from mi_ring.system import command
@@ -114,6 +117,49 @@ def test_an_empty_mask_is_named_and_the_rest_is_looked_at(broken_capture, tmp_pa
     edit_images(path, np.zeros_like, "masks", "005")
     status, text = run(path, tmp_path, capsys)
     assert status == 1 and text.count("Problem") == 1 and "Problem: 005.png: its mask is empty" in text, text
+
+
+def test_masks_of_several_labels_are_named_with_their_values(broken_capture, tmp_path, capsys):
+    """The object and what it stands on: nobody knows which is which."""
+    path, _ = broken_capture
+
+    def labels(mask):
+        mask = np.where(mask > 127, 2, 0).astype(np.uint8)
+        mask[-9:, :13] = 3
+        return mask
+
+    edit_images(path, labels, "masks", "004")
+    with pytest.raises(InputError, match='004.png: photograph "004", mask: has the values 0, 2, 3; save the object as'):
+        run(path, tmp_path, capsys)
+    with pytest.raises(InputError, match='004.png: photograph "004", mask: has the values 0, 2, 3; save the object as'):
+        load_capture(path)  # as a fit does
+    edit_images(path, lambda mask: np.where(mask == 3, 0, mask), "masks", "004")
+    assert run(path, tmp_path, capsys)[0] == 0
+
+
+@pytest.mark.parametrize(("bits", "saturation", "words"), [
+    (12, "", "is 4095, as of 12 bits: over-exposed pixels are not known; .* saturation 0.06248"),
+    (14, "", "is 16383, as of 14 bits.* saturation 0.25$"),
+    (12, '<float name="saturation" value="0.06248"/>', None), (16, "", None),
+])  # fmt: skip
+def test_photographs_of_fewer_bits_in_files_of_sixteen(broken_capture, tmp_path, capsys, bits, saturation, words):
+    """A part of the object is over-exposed; its values are linear, and relative."""
+    path, _ = broken_capture
+    path.write_text(re.sub(r'(value="images/\d+.png"/>)', rf"\1{saturation}", path.read_text()))
+
+    def stored(image):
+        linear = srgb_to_linear(image / 255)
+        return (np.minimum(linear / np.quantile(linear, 0.99), 1) * (2**bits - 1) + 0.5).astype(np.uint16)
+
+    edit_images(path, stored)
+    status, text = run(path, tmp_path, capsys)
+    found = [line for line in text.splitlines() if " bits" in line]
+    if words:
+        assert status == 1 and len(found) == 1 and re.search(f"Problem: the largest value .* {words}", found[0]), text
+    else:
+        assert not found, text
+    clipped = [float(line.split()[5].rstrip("%")) for line in text.splitlines() if re.match(r" *\d{3}.png", line)]
+    assert len(clipped) == 12 and (max(clipped) > 1) == (words is None)
 
 
 @pytest.mark.parametrize("wrong", [lambda mask: 255 - mask, lambda mask: np.full_like(mask, 255)])

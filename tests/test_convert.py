@@ -27,8 +27,9 @@ from helpers.foreign_captures import (
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from mi_ring import convert, foreign, images
+from mi_ring import convert, foreign
 from mi_ring.capture import loading
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.importers import colmap as importer
 from mi_ring.rendering.pinhole import Pinhole
@@ -136,8 +137,44 @@ def test_transforms_of_nerf(tmp_path):
     inside = disc()[..., 0] > 0
     assert masked.all() and (mask[0].numpy() == inside).all()
     assert not rgb[0].numpy()[~inside].any()  # what is transparent is black
-    expected = images.srgb_to_linear(noise(np.uint8, 4, seed=1)[..., :3] / np.float32(255))
+    expected = srgb_to_linear(noise(np.uint8, 4, seed=1)[..., :3] / np.float32(255))
     np.testing.assert_allclose(rgb[0].numpy()[inside], expected[inside], atol=1e-6)
+
+
+@pytest.mark.parametrize("k1", [0, 0.1])
+@pytest.mark.parametrize(("bits", "largest"), [(12, 4095), (12, 3000), (14, 16383), (16, 65535), (16, 16382)])
+def test_low_bits_of_sixteen(tmp_path, capsys, bits, largest, k1):
+    """Of each photograph a strip is over-exposed, if one is; undistorted files say the same."""
+    frames = [{"file_path": f"{k}.png"} for k in range(2)]
+
+    def stored(k):
+        pixels = noise(np.uint16, seed=k) // 65535 * 7 + noise(np.uint16, seed=k) % (largest // 2)
+        pixels[10:40, 7 + k : 30] = largest - 1 + k  # only the last one has the largest value
+        return pixels
+
+    folder = transforms(tmp_path / "in", {"fl_x": 70.0, "fl_y": 76.0, "k1": k1}, frames, stored)
+    scene = converted("transforms", folder, tmp_path / "s.xml")
+    full = 2**bits - 1
+    note = f"No value of 2 photographs of 16 bits is above {largest}: taken for {bits} bits, over-exposed at {full}"
+    assert (note in capsys.readouterr().out) == (bits < 16)
+    for k in range(2):
+        rgb, clipped, _, _, valid = scene.observe([k])
+        np.testing.assert_allclose(rgb[0, 25, 20].numpy(), (largest - 1 + k) / 65535, rtol=1e-6)
+        assert clipped[0, 25, 20].all() == (k == 1 and largest == full)
+        assert not clipped[0][np.ones((H, W), bool) if valid is None else valid[0].numpy()][:W].any()
+
+
+def test_low_bits_of_a_curve_are_refused(tmp_path):
+    folder = transforms(tmp_path / "in", {"fl_x": 70.0}, [{"file_path": "0.png"}], lambda k: noise(np.uint16) // 16)
+    refused(["transforms", folder, "--encoding", "srgb"], "0.png: has values of 12 bits, at most 4095, but colours "
+            "that need 16 bits; multiply the values by 16", tmp_path / "out/s.xml")  # fmt: skip
+
+
+def test_masks_of_several_labels_are_refused_with_their_values(tmp_path):
+    folder = transforms(tmp_path / "in", {"fl_x": 70.0}, [{"file_path": "a.png"}], lambda k: noise(np.uint8))
+    write(folder / "masks/a.png", disc() // 255 + disc()[::-1] // 255 * np.uint8(2))
+    refused(["transforms", folder], "masks/a.png: mask: has the values 0, 1, 2, 3; save the object as 255, and all "
+            "else as 0", tmp_path / "out/s.xml")  # fmt: skip
 
 
 @pytest.mark.parametrize("top", [{"fl_x": 1.1, "cx": 0.5, "cy": 0.5}, {"fl_x": 70.0, "cx": 0, "cy": 0}])

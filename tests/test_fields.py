@@ -136,6 +136,9 @@ FLAT = {
     "polycam": """t_00 t_13 t_23 fx fy cx cy width height timestamp blur_score neighbors manual_keyframe center_depth
      angular_velocity""",
     "record3d": "K perFrameIntrinsicCoeffs w h poses dw dh fps initPose frameTimestamps cameraType depthScale",
+    "sdfstudio": """camera_model height width has_mono_prior has_sensor_depth has_foreground_mask pairs worldtogt
+     scene_box frames frames/rgb_path frames/camtoworld frames/intrinsics frames/mono_depth_path
+     frames/mono_normal_path frames/sensor_depth_path frames/foreground_mask frames/sfm_sparse_points_view""",
     "gltf": """nodes/name nodes/camera nodes/children nodes/matrix nodes/translation nodes/rotation nodes/scale
      cameras/name perspective/yfov perspective/aspectRatio perspective/znear perspective/zfar KHR_lights_punctual meshes
      materials""",

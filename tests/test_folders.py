@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from helpers.ellipsoid_pictures import AXES, CENTER, hit_ellipsoid, in_a_dim_room, pose_at, poses, rays_of
 from PIL import ExifTags, Image, ImageOps
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -282,6 +283,21 @@ def save_turned(pixels, path, orientation):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
     Image.fromarray(pixels).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_the_alpha_of_a_grey_photograph_is_its_mask(tmp_path, kind):
+    grey, alpha = (np.arange(35).reshape(5, 7) * step % np.iinfo(kind).max for step in (7, 1000))
+    pixels = np.dstack([grey, alpha]).astype(kind)
+    file = tmp_path / "a.tif"
+    if kind == np.uint8:
+        file = tmp_path / "a.png"
+        Image.fromarray(pixels).save(file)
+    else:
+        tifffile.imwrite(file, pixels, photometric="minisblack", planarconfig="contig", extrasamples=["unassalpha"])
+    picture = Picture(file)
+    np.testing.assert_array_equal(picture.pixels, pixels[..., [0, 0, 0, 1]])
+    np.testing.assert_array_equal(picture.mask("alpha"), pixels[..., 1] // (np.iinfo(kind).max // 255))
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])

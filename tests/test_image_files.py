@@ -15,7 +15,7 @@ from helpers.foreign_captures import colmap_folder, converted, disc, noise, tran
 from PIL import ExifTags, Image, ImageCms, PngImagePlugin
 
 from mi_ring import convert, image_fields, image_headers, images
-from mi_ring.colour_profiles import Statement, as_stated, primaries_profile
+from mi_ring.colour_profiles import Statement, as_stated, primaries_profile, srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.importers.photogrammetry import exposures_of
 from mi_ring.importers.reading import has_alpha, pixels_of
@@ -322,7 +322,7 @@ def test_primaries_of_openexr(tmp_path):
 ])  # fmt: skip
 def test_colours_that_are_said_without_a_profile(tmp_path, write, close):
     """Display P3 by the codes of H.273, and Adobe RGB by EXIF, are converted by numpy here."""
-    primaries, curve = P3, images.srgb_to_linear
+    primaries, curve = P3, srgb_to_linear
     encoded = images.linear_to_srgb(stripes())
     write(tmp_path / "a", stripes())
     file = next(tmp_path.iterdir())
@@ -485,20 +485,38 @@ def test_whether_there_is_alpha_is_seen_without_pixels(tmp_path, monkeypatch, wr
 
 def test_a_mask_may_be_in_the_alpha_channel_of_its_file():
     colours, alpha = np.full((2, 3, 3), 90, np.uint8), np.array([[0, 255, 0], [255, 0, 128]], np.uint8)
-    assert (images.mask_values(np.dstack([colours, alpha])) == alpha).all()
+    assert (images.mask_values(np.dstack([colours, alpha]), "m") == alpha).all()
     opaque = np.dstack([alpha, alpha, alpha, np.full_like(alpha, 255)])
-    assert (images.mask_values(opaque) == alpha).all() and (images.mask_values(alpha[..., None]) == alpha).all()
+    assert (images.mask_values(opaque, "m") == alpha).all() and (
+        images.mask_values(alpha[..., None], "m") == alpha
+    ).all()
 
 
 def test_the_object_in_a_mask_may_have_any_label_or_colour():
     shown = np.array([[0, 1, 0], [1, 0, 1]], bool)
     for kind, label in ((np.uint8, 1), (np.uint8, 128), (np.uint16, 1), (np.uint16, 65535), (np.float32, 0.25)):
-        mask = images.mask_values((shown * label).astype(kind)[..., None])
+        mask = images.mask_values((shown * label).astype(kind)[..., None], "m")
         assert mask.dtype == np.uint8 and (mask == 255 * shown).all()
     for colour in ([0, 255, 0], [0, 0, 200, 255], [255, 0, 0]):
-        assert (images.mask_values((shown[..., None] * colour).astype(np.uint8)) == 255 * shown).all()
+        assert (images.mask_values((shown[..., None] * colour).astype(np.uint8), "m") == 255 * shown).all()
     soft = np.array([[[0], [3], [200]]], np.uint8)
-    assert (images.mask_values(soft) == soft[..., 0]).all()
+    assert (images.mask_values(soft, "m") == soft[..., 0]).all()
+
+
+@pytest.mark.parametrize(("kind", "values", "words"), [
+    (np.uint8, [0, 1, 2, 3], "0, 1, 2, 3; save the object as 255"), (np.uint8, [7, 7], "7; save the object as 255"),
+    (np.uint16, [0, 1, 1000], "0, 1, 1000; save the object as 65535"),
+    (np.float32, [0, 1, 2.5], "0, 1, 2.5; save the object as 1"),
+    (np.uint8, range(9), "0, 1, 2, 3, 4, 5, …; save the object as 255"),
+])  # fmt: skip
+def test_a_mask_of_several_labels_is_refused(kind, values, words):
+    with pytest.raises(InputError, match=f"^masks/a.png: mask: has the values {words}, and all else as 0"):
+        images.mask_values(np.array([values, values], kind)[..., None], "masks/a.png: mask")
+
+
+def test_a_dim_mask_of_many_values_is_empty():
+    dim = np.arange(100, dtype=np.uint8).reshape(10, 10, 1)
+    assert (images.mask_values(dim, "m") == dim[..., 0]).all()
 
 
 @pytest.mark.parametrize("label", [1, 255])

@@ -404,6 +404,28 @@ def test_mistakes_in_a_table(tmp_path, changes, pattern):
     refused(["realitycapture", csv_table(tmp_path, **changes)], pattern, tmp_path)
 
 
+def moved(path, scale, x, y):
+    """The table, with places scaled and moved."""
+    head, columns, *rows = path.read_text("utf-8-sig").splitlines()
+    cells = [row.split(",") for row in rows]
+    rows = [",".join([c[0], repr(float(c[1]) * scale + x), repr(float(c[2]) * scale + y), *c[3:]]) for c in cells]
+    path.write_text("\n".join([head, columns, *rows]))
+    return path
+
+
+@pytest.mark.parametrize(("x", "y"), [(14.4, 50.1), (50.1, 14.4), (-0.001, 51.48), (-179.5, -0.2)])
+def test_a_table_in_degrees_is_refused(tmp_path, x, y):
+    path = moved(csv_table(tmp_path), 1e-5, x, y)
+    refused(["realitycapture", path], "cameras.csv: columns x, y: are latitudes and longitudes", tmp_path)
+    path.write_text(path.read_text().replace("#name,x,y,", "#name,longitude,latitude,"))
+    refused([path], "cameras.csv: column longitude: are latitudes and .* local metric system", tmp_path)
+
+
+@pytest.mark.parametrize(("scale", "x", "y"), [(1, 14.4, 50.1), (1e-3, 0, 0), (1, 458000, 5550000), (0.01, 14.4, 50.1)])
+def test_a_table_in_metres_is_none_of_degrees(tmp_path, scale, x, y):
+    assert len(taken(RealityCapture(moved(csv_table(tmp_path), scale, x, y), Path()))) == 3
+
+
 def test_a_sidecar_is_of_one_photograph(tmp_path):
     folder = sidecars(tmp_path / "in")
     refused(

@@ -20,6 +20,7 @@ from playwright.sync_api import sync_playwright
 
 from mi_ring import fit, images
 from mi_ring.capture.loading import load_capture
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.fitting.fit import Fit
 from mi_ring.output import report, svg
 
@@ -309,7 +310,7 @@ def test_draw_is_the_photograph_that_mitsuba_takes(open_page, page_file, fitted,
     a, b = np.moveaxis((points - corner) @ np.linalg.pinv(np.stack([u, v], 1)).T, -1, 0)
     to_light = light - points
     distance = np.linalg.norm(to_light, axis=-1)
-    colour = images.srgb_to_linear(quarters / 255)[(b > 0.5).astype(int), (a > 0.5).astype(int)]
+    colour = srgb_to_linear(quarters / 255)[(b > 0.5).astype(int), (a > 0.5).astype(int)]
     radiance = colour / 0.8 / np.pi * intensity * (to_light @ normal / distance**3)[..., None]
     edge = np.minimum(np.minimum(a, 1 - a) * 5, np.minimum(b, 1 - b) * 4)  # about how far inside
     clear = (edge > 0.4) & (abs(a - 0.5) > 0.1) & (abs(b - 0.5) > 0.1)  # not where colours blend

@@ -19,6 +19,7 @@ from mi_ring.importers.metashape import Metashape
 from mi_ring.importers.opensfm import OpenSfm
 from mi_ring.importers.polycam import Polycam
 from mi_ring.importers.record3d import Record3D
+from mi_ring.importers.sdfstudio import SdfStudio
 from mi_ring.importers.visualsfm import VisualSfm
 
 
@@ -310,6 +311,47 @@ def test_mistakes_in_record3d(tmp_path, edit, pattern):
     refused(["record3d", structure_files.record3d(tmp_path, edit=edit)], pattern, tmp_path)
 
 
+# SDFStudio
+
+
+def test_sdfstudio(tmp_path):
+    folder = structure_files.sdfstudio(tmp_path)
+    pixels = [structure_files.pinhole_pixels(k, lens) for k, lens in enumerate(structure_files.LENSES)]
+    for src in (folder, folder / "meta_data.json"):
+        frames = taken(source := SdfStudio(src, Path()))
+        agree(frames, pixels, ["000000_rgb.png", "000001_rgb.png", "000002_rgb.png"])
+        assert [frame.mask and frame.mask.name for frame in frames] == [None, "000001_foreground_mask.png", None]
+        told = "worldtogt (the frame of the true mesh; the cameras keep theirs)"
+        assert f"{folder}/meta_data.json: not used: {told}" in source.notes
+
+
+def test_of_sdfstudio_only_what_may_matter_is_named(tmp_path):
+    def edit(own):
+        own["worldtogt"] = np.eye(4).tolist()
+        own["frames"][2]["distortion"] = [0.1]
+
+    source = SdfStudio(structure_files.sdfstudio(tmp_path, edit), Path())
+    taken(source)
+    assert [note.partition("not used: ")[2] for note in source.notes if "not used: " in note] == [
+        "frames/distortion (unknown)"
+    ]
+
+
+@pytest.mark.parametrize(("edit", "pattern"), [
+    (dict.clear, "meta_data.json: frames: found none"),
+    (lambda own: own.update(camera_model="FISHEYE"), "camera_model: is 'FISHEYE'; must be OPENCV"),
+    (lambda own: own.update(width="wide"), "width, height: is "),
+    (lambda own: own["frames"].__setitem__(1, 3), r"frames\[1\]: is no object"),
+    (lambda own: own["frames"][1].pop("rgb_path"), r"frames\[1\].rgb_path: missing"),
+    (lambda own: own["frames"][1].pop("camtoworld"), r"frames\[1\].camtoworld: is missing; must be 4 x 4 numbers"),
+    (lambda own: own["frames"][1].update(intrinsics=[1, 2]), r"frames\[1\].intrinsics: is of shape \(2,\)"),
+    (lambda own: own["frames"][1]["intrinsics"][0].__setitem__(1, 9), "has skew"),
+    (lambda own: own["frames"][1].update(foreground_mask="no.png"), r"frames\[1\].foreground_mask: no mask 'no.png'"),
+])  # fmt: skip
+def test_mistakes_in_sdfstudio(tmp_path, edit, pattern):
+    refused(["sdfstudio", structure_files.sdfstudio(tmp_path, edit)], pattern, tmp_path)
+
+
 # glTF
 
 
@@ -404,6 +446,7 @@ NEW = {
     "bundler": (structure_files.bundler, "bundle/bundle.out"), "visualsfm": (structure_files.visualsfm, "model.nvm"),
     "opensfm": (structure_files.opensfm, "opensfm/reconstruction.json"), "polycam": (structure_files.polycam, ""),
     "record3d": (structure_files.record3d, "metadata.json"), "gltf": (structure_files.gltf, "cameras.gltf"),
+    "sdfstudio": (structure_files.sdfstudio, "meta_data.json"),
 }  # fmt: skip
 OTHERS = {
     "colmap": (structure_files.colmap_rig, ""), "metashape": (photogrammetry_files.metashape, "cameras.xml"),
@@ -461,6 +504,7 @@ def test_what_may_be_several_formats_or_none_is_one_line(tmp_path):
 
 
 def test_damaged_files_are_not_taken_for_cameras(tmp_path):
-    for name in ("bundle.out", "a.nvm", "reconstruction.json", "metadata.json", "a.glb", "a.gltf", "a.sfm", "a.xml"):
+    of_json = "reconstruction.json", "metadata.json", "meta_data.json", "a.sfm"
+    for name in ("bundle.out", "a.nvm", "a.glb", "a.gltf", "a.xml", *of_json):
         (tmp_path / name).write_bytes(b"[3, 4]")
     refused([tmp_path], "SRC: found no cameras", tmp_path)

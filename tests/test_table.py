@@ -7,7 +7,8 @@ from helpers.ellipsoid_pictures import CENTER, LENS, hit_ellipsoid, poses, rays_
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import scene_bytes, scene_element
-from mi_ring.images import linear_to_srgb, srgb_to_linear, write_image
+from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.images import linear_to_srgb, write_image
 from mi_ring.importers.writer import Writer
 from mi_ring.metrics.path_tracing import open_lit_scene, render_path
 from mi_ring.photogrammetry.capture_files import OBJECT, PosedPicture, write_table

@@ -8,8 +8,9 @@ import pytest
 import torch
 from helpers.foreign_captures import converted, transforms
 
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.geometry.hull import Hull, Silhouette
-from mi_ring.images import linear_to_srgb, srgb_to_linear
+from mi_ring.images import linear_to_srgb
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import undistort
 

@@ -138,10 +138,7 @@ def mask_of(mask: ArrayLike | None, image: np.ndarray, what: str) -> np.ndarray 
     if array.dtype not in (np.uint8, bool) or array.shape != image.shape[:2]:
         raise InputError(f"{what}: is {array.dtype} of shape {array.shape}; must be {image.shape[:2]} of bool, or of "
                          "uint8 from 0 to 255")  # fmt: skip
-    array = mask_values((array * np.uint8(255) if array.dtype == bool else array)[..., None])  # as of a file
-    if array.max() == 1:
-        raise InputError(f"{what}: has 1 inside; must be bool, or uint8 with 255 inside")
-    return array
+    return mask_values((array * np.uint8(255) if array.dtype == bool else array)[..., None], what)  # as of a file
 
 
 def camera_of(camera: Camera | None, image: np.ndarray, what: str) -> Camera:

@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import LARGEST, InputError, is_file
 from mi_ring.foreign import reading
 from mi_ring.image_headers import image_size
-from mi_ring.images import contrasted, linear_to_srgb, mask_values, read_image, srgb_to_linear
+from mi_ring.images import contrasted, linear_to_srgb, mask_values, read_image
 from mi_ring.scene.shot import Encoding, Shot
 
 
@@ -162,4 +163,4 @@ def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:
     if itself and pixels.shape[2] not in (2, 4):
         raise InputError(f'{file}: photograph "{shot.name}", {field}: is the photograph itself, which has no '
                          "alpha channel")  # fmt: skip
-    return mask_values(pixels[:, :, -1:] if itself else pixels)
+    return mask_values(pixels[:, :, -1:] if itself else pixels, f'{file}: photograph "{shot.name}", {field}')

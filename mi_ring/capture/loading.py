@@ -1,6 +1,7 @@
 """Reads scene files, and raises an InputError for anything that cannot be fitted."""
 
 import math
+import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import replace
@@ -139,7 +140,7 @@ def require_scene(path: Path) -> None:
 def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
     """Load a scene file. Returns (Mitsuba scene, its photographs as `Shot`, without pixels).
 
-    Raises InputError if the file cannot be read, or if it has no photographs.
+    Raises InputError if the file cannot be read, if it has no photographs, or if two of them have the same image file.
     """
     require_scene(path)
     try:
@@ -156,6 +157,11 @@ def open_scene(path: Path) -> tuple[mi.Scene, tuple[Shot, ...]]:
         raise InputError(f"{path}: {error}") from error
     if not shots:
         raise InputError(f'{path}: sensor: found no <sensor type="photograph">; one per photograph is needed')
+    known: dict[str, Shot] = {}
+    for shot in shots:
+        if (other := known.setdefault(os.path.realpath(str(shot.files.filename)), shot)) is not shot:
+            raise InputError(f'{path}: photographs "{other.name}" and "{shot.name}": filename: both are '
+                             f"{shot.files.filename}; give each its own, or remove one")  # fmt: skip
     return scene, shots
 
 
@@ -167,9 +173,9 @@ def photographs_in(scene: mi.Scene) -> list[photograph.Photograph]:
 def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
     """Raise InputError if a scene file is no XML, or if it does not say where a camera or a photograph's light is.
 
-    Mitsuba would then use the origin. The last row of a pose matrix must be 0 0 0 1, because Mitsuba ignores it. Files
-    that the scene includes are checked, too. `above`: the files that include this one; empty for the scene file. Raises
-    UnicodeDecodeError if the file is not UTF-8.
+    Mitsuba would then use the origin, also for a pose matrix of 9 numbers, which is a rotation alone. The last row of a
+    pose matrix must be 0 0 0 1, because Mitsuba ignores it. Files that the scene includes are checked, too. `above`:
+    the files that include this one; empty for the scene file. Raises UnicodeDecodeError if the file is not UTF-8.
     """
     content = path.read_bytes()
     content.decode("utf-8")
@@ -182,8 +188,13 @@ def require_xml(path: Path, above: tuple[Path, ...] = ()) -> None:
         name = f'{path}: photograph "{sensor.get("id", "")}"'
         if sensor.find("*[@name='to_world']") is None:
             raise InputError(f"{name}: to_world is missing; give the pose of its camera")
+        parts = {element.tag for element in sensor.iterfind("transform/*")}
         for element in sensor.iterfind("transform/matrix"):
-            row = element.get("value", "").replace(",", " ").split()[12:]
+            words = element.get("value", "").replace(",", " ").split()
+            if len(words) == 9 and not parts & {"translate", "lookat"}:  # Mitsuba puts it at the origin
+                raise InputError(f"{name}: to_world: its matrix has 9 numbers, a rotation without a place; give 16, "
+                                 "the last four 0 0 0 1, or a <translate> after it")  # fmt: skip
+            row = words[12:]
             if len(row) == 4 and not is_affine(row):
                 raise InputError(f"{name}: to_world: the last row of its matrix is {' '.join(row)}, must be 0 0 0 1; "
                                  "is it transposed?")  # fmt: skip

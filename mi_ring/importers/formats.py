@@ -21,6 +21,7 @@ from mi_ring.importers.polycam import Polycam
 from mi_ring.importers.reading import list_images, load_json, load_xml
 from mi_ring.importers.realitycapture import POSE, RealityCapture, read_csv, sidecars_in, xmp_fields
 from mi_ring.importers.record3d import Record3D
+from mi_ring.importers.sdfstudio import SdfStudio
 from mi_ring.importers.sfmdata import SfmData
 from mi_ring.importers.transforms import Transforms
 from mi_ring.importers.visualsfm import VisualSfm
@@ -29,7 +30,7 @@ FORMATS: dict[str, type[Source]] = {
     "diligent-mv": DiligentMV, "transforms": Transforms, "colmap": Colmap, "neus": Neus, "iron": Iron,
     "metashape": Metashape, "realitycapture": RealityCapture, "sfmdata": SfmData, "llff": Llff,
     "middlebury": Middlebury, "bundler": Bundler, "visualsfm": VisualSfm,
-    "opensfm": OpenSfm, "polycam": Polycam, "record3d": Record3D, "gltf": GltfCameras,
+    "opensfm": OpenSfm, "polycam": Polycam, "record3d": Record3D, "sdfstudio": SdfStudio, "gltf": GltfCameras,
 }  # fmt: skip
 
 
@@ -42,9 +43,9 @@ class Sign(NamedTuple):
     check: Callable[[Path], Any]  #: is this file, or folder, of the format?
 
 
-def has(*fields: str) -> Callable[[Path], bool]:
-    """Make a function of a path: it returns whether the file is a JSON object in which one of `fields` is not empty."""
-    return lambda path: isinstance(top := load_json(path), dict) and any(top.get(field) for field in fields)
+def json_object(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file. Returns an empty dict if that is no object."""
+    return top if isinstance(top := load_json(path), dict) else {}
 
 
 def has_files(*names: str) -> Callable[[Path], bool]:
@@ -62,7 +63,7 @@ def has_sidecars(folder: Path) -> bool:
 def has_keyframes(folder: Path) -> bool:
     """Return True if a folder, or its subfolder keyframes, contains Polycam's cameras."""
     cameras = (next(place.glob("*cameras/[!.]*.json"), None) for place in (folder, folder / "keyframes"))
-    return any(isinstance(own := load_json(path), dict) and "t_00" in own for path in cameras if path)
+    return any("t_00" in json_object(path) for path in cameras if path)
 
 
 def begins(path: Path, word: bytes) -> bool:
@@ -75,14 +76,17 @@ def begins(path: Path, word: bytes) -> bool:
 SIGNS = (
     Sign("colmap", "a model of COLMAP", (), Colmap.model),
     Sign("transforms", "transforms.json", Transforms.names,
-         lambda path: path.name in Transforms.names or has("frames")(path)),
+         lambda path: path.name in Transforms.names or (path.name not in SdfStudio.names
+                                                        and json_object(path).get("frames"))),
+    Sign("sdfstudio", "meta_data.json of SDFStudio", SdfStudio.names,
+         lambda path: path.name in SdfStudio.names and json_object(path).get("frames")),
     Sign("metashape", "*.xml of Metashape", ("*.xml",), lambda path: chunks_of(load_xml(path))),
     Sign("realitycapture", "*.xmp or *.csv of RealityCapture", (), has_sidecars),
-    Sign("realitycapture", "", ("*.csv",), lambda path: {"name", *POSE, "f"} <= {*read_csv(path)[0]}),
+    Sign("realitycapture", "", ("*.csv",), lambda path: {"name", *POSE[2:], "f"} <= {*read_csv(path)[0]}),
     Sign("llff", "poses_bounds.npy", (), has_files("poses_bounds.npy")),
     Sign("middlebury", "*_par.txt", ("*_par.txt",), lambda path: path.name.endswith("_par.txt")),
     Sign("sfmdata", "*.sfm or sfm_data.json", ("cameras.sfm", "sfm.json", "sfm_data.json", "*.sfm"),
-         lambda path: has("views")(path) and has("poses", "extrinsics")(path)),
+         lambda path: (top := json_object(path)).get("views") and (top.get("poses") or top.get("extrinsics"))),
     Sign("bundler", "bundle.out", (*Bundler.names, "*.bundle.out", "bundle.rd.out"),
          lambda path: begins(path, FIRST_LINE.encode())),
     Sign("visualsfm", "*.nvm", ("*.nvm",), lambda path: begins(path, b"NVM_V3")),
@@ -90,7 +94,7 @@ SIGNS = (
          lambda path: isinstance(top := load_json(path), list) and isinstance(top[0], dict) and "shots" in top[0]),
     Sign("polycam", "keyframes of Polycam", (), has_keyframes),
     Sign("record3d", "metadata.json of Record3D", Record3D.names,
-         lambda path: path.name in Record3D.names and has("poses")(path)),
+         lambda path: path.name in Record3D.names and json_object(path).get("poses")),
     Sign("gltf", "*.glb or *.gltf with cameras", ("*.glb", "*.gltf"), has_cameras),
     Sign("neus", "cameras_sphere.npz", (), has_files("cameras_sphere.npz", "cameras.npz")),
     Sign("iron", "cam_dict_norm.json", (), has_files(*Iron.names)),

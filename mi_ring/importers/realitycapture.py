@@ -21,6 +21,9 @@ XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 POSE = ("x", "y", "alt", "heading", "pitch", "roll")  #: columns of a table [scene units, degrees]
 TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")  #: coefficients of the distortion
 NUMBERS = {*POSE, "f", "px", "py", *TERMS}  #: columns that hold numbers
+DEGREES = ("lat", "latitude", "lon", "long", "lng", "longitude")  #: columns of geographic coordinates
+METRIC = ("are latitudes and longitudes [degrees]; export the cameras in a local metric system, such as "
+          "local:1 - Euclidean")  # fmt: skip
 DECIMAL = re.compile(r"[-+\d]+,\d*([eE][-+]?\d+)?")  #: a number with a comma
 #: Distortion models, and the number of coefficients that each uses.
 BROWN = {"perspective": 0, "none": 0, "brown3": 3, "brown4": 4, "brown3t2": 6, "brown4t2": 6}
@@ -64,36 +67,45 @@ class RealityCapture(Photogrammetry):
         if not (sidecars := sidecars_in(self.src)):
             raise InputError(f"{self.src}: SRC: no XMP sidecars in this folder; give another, or the CSV file of "
                              "internal and external camera parameters")  # fmt: skip
-        images = list_images(self.images or (self.src if list_images(self.src) else self.folder))
-        by_key([image for image in images if image.stem in sidecars], lambda image: image.stem)
+        images = self.photographs
+        if images is None:
+            images = list_images(self.images or (self.src if list_images(self.src) else self.folder))
+        self.without_pose.update(image.name for image in images if image.stem not in sidecars)
+        posed = by_key([image for image in images if image.stem in sidecars], lambda image: image.stem)
         said: dict[str, None] = {}
-        for image in images if self.photographs is None else self.photographs:
-            path = sidecars.get(image.stem)
-            fields = xmp_fields(load_xml(path)) if path else {}
+        for name, image in posed.items():
+            fields = xmp_fields(load_xml(sidecars[name]))
             said.update((f"xcr:{name}", None) for name in fields)
             if "Rotation" in fields and "Position" in fields:
-                yield sidecar_frame(image, fields, str(path))
+                yield sidecar_frame(image, fields, str(sidecars[name]))
             else:
                 self.without_pose.add(image.name)
         if self.photographs is None:
-            lost = sorted(sidecars.keys() - {image.stem for image in images})
+            lost = sorted(sidecars.keys() - posed.keys())
             self.without_photograph.extend(name for name in lost if "Rotation" in xmp_fields(load_xml(sidecars[name])))
         self.tell_unused(self.src, said)
 
     def from_csv(self) -> Iterator[Frame]:
         """Yield the photographs that the CSV file SRC lists. Raises InputError if it is invalid."""
         columns, rows = read_csv(self.src)
+        if "x" not in columns and (degrees := [name for name in columns if name in DEGREES]):
+            raise InputError(f"{self.src}: column {degrees[0]}: {METRIC}")
         if missing := [name for name in ("name", *POSE, "f") if name not in columns]:
             raise InputError(f"{self.src}: column {missing[0]}: is missing; must be the table of internal and external "
                              "camera parameters")  # fmt: skip
         self.tell_unused(self.src, columns)
+        cameras = []
         for line, row in enumerate(rows, 1):
             what = f"{self.src}: camera {line}"
             if len(row) != len(columns):
                 raise InputError(f"{what}: has {len(row)} columns; must have {len(columns)}")
             cells = dict(zip(columns, row))
             numbers = {name: float(matrix(cells[name], (), f"{what}: {name}")) for name in columns if name in NUMBERS}
-            if (image := self.photograph(cells["name"], what)) is None:
+            cameras.append((what, cells["name"], numbers))
+        if in_degrees(np.array([[numbers["x"], numbers["y"]] for _, _, numbers in cameras]).reshape(-1, 2)):
+            raise InputError(f"{self.src}: columns x, y: {METRIC}")
+        for what, said, numbers in cameras:
+            if (image := self.photograph(said, what)) is None:
                 continue
             # At zero angles the camera looks down and its top points to y. The heading is clockwise, as on a compass.
             angles = [-numbers["heading"], numbers["pitch"], numbers["roll"]]
@@ -101,7 +113,16 @@ class RealityCapture(Photogrammetry):
             pose = pose_of(R, np.array([numbers[name] for name in POSE[:3]])) @ OPENGL
             terms, centre = ([numbers.get(name, 0.0) for name in names] for names in (TERMS, ("px", "py")))
             lens = film_lens(image, numbers["f"], centre, terms, what)
-            yield Frame(image, lens, pose, said=cells["name"])
+            yield Frame(image, lens, pose, said=said)
+
+
+def in_degrees(places: np.ndarray) -> bool:
+    """Return whether places (N, 2) are latitudes and longitudes [degrees].
+
+    0.00001 degrees are a metre: all cameras have almost the same numbers.
+    """
+    largest = np.abs(places).max(initial=0)
+    return bool(len(places) > 1 and largest <= 180 and 0 < np.ptp(places, 0).max() < min(0.05, 1e-3 * largest))
 
 
 def sidecars_in(folder: Path) -> dict[str, Path]:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.ndimage
 
-from mi_ring.images import linear_to_srgb, srgb_to_linear
+from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.images import linear_to_srgb
 from mi_ring.importers.camera_models import Lens
 
 AT_ONCE = 2**22  #: pixels; interpolating them takes about half a gigabyte

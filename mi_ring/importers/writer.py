@@ -124,7 +124,7 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
         turned = turn > 1 and image_size(file) != frame.lens.size
         if straight and not frame.fill_mask and not turned:
             return None
-        mask = oriented(mask_values(pixels_of(file)), turn if turned else 1)[..., None]
+        mask = oriented(mask_values(pixels_of(file), f"{file}: mask"), turn if turned else 1)[..., None]
         if frame.fill_mask:
             mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
         return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]

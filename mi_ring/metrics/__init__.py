@@ -1,5 +1,5 @@
 """Measures the quality of captures, fits and the renderer.
 
-May import: mitsuba, drjit, numpy, scipy, skimage, trimesh, gpytoolbox, torch, igl; images, capture, plugins,
-rendering, objects, scene, geometry, system.
+May import: mitsuba, drjit, numpy, scipy, skimage, trimesh, gpytoolbox, torch, igl; image_headers, images, capture,
+plugins, rendering, objects, scene, geometry, system.
 """

@@ -11,6 +11,8 @@ from scipy import ndimage, stats
 from mi_ring.capture.brightness_masks import dark_threshold
 from mi_ring.capture.capture import Capture
 from mi_ring.geometry.hull import MAX_WIDTH, shrink_mask
+from mi_ring.image_headers import bits_of
+from mi_ring.images import LOW_BITS, largest_value, read_image
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 from mi_ring.system.files import read_json
 
@@ -204,6 +206,12 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
             found.append(f"{row.name}: is {times}, for the light that it gets: exposure or light is wrong")
     if (share := np.median([row.clipped for row in rows])) > CLIPPED:
         found.append(f"{share:.0%} of the object is over-exposed; expose less")
+    files = (shot.files.filename for shot in capture.shots)
+    largest = largest_value(read_image(file) for file in files if file and bits_of(file) == 16)
+    if largest in LOW_BITS and max(shot.saturation for shot in capture.shots) * 65535 > largest:
+        found.append(f"the largest value of the photographs of 16 bits is {largest}, as of {LOW_BITS[largest]} bits: "
+                     "over-exposed pixels are not known; give the photographs in the scene file the saturation "
+                     f"{(largest - 0.5) / 65535:.4g}")  # fmt: skip
     if (share := np.median([row.dark for row in rows])) > DARK:
         found.append(f"{share:.0%} of the object is black: under-exposed, or unlit")
     if not any(capture.masks.given) and dark_threshold(capture) is None:

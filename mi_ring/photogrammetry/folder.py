@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image
 
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.image_headers import HEIF, KINDS, RAW, SUFFIXES, encoding_of, exif_of, open_image
-from mi_ring.images import linear_to_srgb, mask_values, orientation_axes, oriented, read_image, srgb_to_linear
+from mi_ring.images import linear_to_srgb, mask_values, orientation_axes, oriented, read_image
 from mi_ring.importers.named_photographs import MASK_AFFIX
 from mi_ring.importers.photogrammetry import exposures_of
 from mi_ring.importers.reading import image_size, read_as
@@ -47,7 +48,7 @@ class Picture:
 
     @cached_property
     def pixels(self) -> np.ndarray:
-        """Pixels (H, W, C) uint8 or uint16. They are turned upright if `upright` is set. See also `encoding`.
+        """Pixels (H, W, 3 or 4) uint8 or uint16. They are turned upright if `upright` is set. See also `encoding`.
 
         Floats become uint16: 1 is full scale, and larger values are clipped. Raises InputError if the file cannot be
         read.
@@ -64,12 +65,13 @@ class Picture:
             if not np.isfinite(pixels).all():
                 raise InputError(f"{self.path}: contains pixels that are NaN or infinite")
             pixels = (pixels.clip(0, 1) * 65535 + 0.5).astype(np.uint16)
-        return np.repeat(pixels[:, :, :1], 3, 2) if pixels.shape[2] < 3 else pixels
+        count = pixels.shape[2]
+        return pixels[:, :, [0, 0, 0, *range(1, count)]] if count < 3 else pixels  # grey, with alpha or without
 
     @property
     def mask_pixels(self) -> np.ndarray:
         """The file, read as a mask (H, W) uint8. It is turned in the same way as `pixels`."""
-        return oriented(mask_values(read_as(self.path, "mask", read_image)), self.orientation)
+        return oriented(mask_values(read_as(self.path, "mask", read_image), f"{self.path}: mask"), self.orientation)
 
     def decode(self, read: Callable[[Any], Any]) -> Any:
         """Open a raw or HEIF file, and return the result of `read(opened)`.

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.geometry.camera import Camera
-from mi_ring.images import srgb_to_linear
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window, source_positions
 from mi_ring.photogrammetry.folder import DECODED, Picture

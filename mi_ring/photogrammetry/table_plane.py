@@ -11,7 +11,7 @@ from trimesh.geometry import align_vectors
 from trimesh.points import plane_fit
 
 from mi_ring.capture.grabcut import dilate_by_share, disk
-from mi_ring.images import srgb_to_linear
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.photogrammetry.flash_light import FlashCalibration, irradiance
 from mi_ring.photogrammetry.reduced_photographs import Masks, ReducedView, Views
 from mi_ring.scene.lights import Light

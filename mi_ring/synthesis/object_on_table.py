@@ -10,9 +10,10 @@ import numpy as np
 import trimesh
 
 from mi_ring.capture.scenefile import Element, emitter_element, table_element
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import read_mesh
-from mi_ring.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
+from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.photogrammetry.marker_sheet import DOTS, page
 from mi_ring.scene.lights import Light
 from mi_ring.scene.plain_mesh import mesh_of

@@ -227,6 +227,11 @@ def record3d(folder: Path) -> Reader:
     return Reader([folder / "metadata.json"], imported(formats.FORMATS["record3d"])(folder))
 
 
+def sdfstudio(folder: Path) -> Reader:
+    structure_files.sdfstudio(folder)
+    return Reader([folder / "meta_data.json"], imported(formats.FORMATS["sdfstudio"])(folder))
+
+
 def guessed(folder: Path) -> Reader:
     """All that `convert` looks for without a format."""
     structure_files.polycam(folder)
@@ -449,8 +454,8 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "neus": neus, "wildlight": wildlight, "iron": iron, "diligent-mv": diligent, "colmap-text": colmap_text,
     "colmap-binary": colmap_binary, "colmap-rig": colmap_rig, "metashape-rig": metashape_rig, "bundler": bundler,
     "visualsfm": structure("visualsfm"), "opensfm": structure("opensfm"), "gltf-cameras": structure("gltf"),
-    "glb-cameras": glb, "polycam": polycam, "record3d": record3d, "guess": guessed, "detect": detected,
-    "scene": scene, "ring.pt": ring, "checkpoint.pt": checkpoint,
+    "glb-cameras": glb, "polycam": polycam, "record3d": record3d, "sdfstudio": sdfstudio, "guess": guessed,
+    "detect": detected, "scene": scene, "ring.pt": ring, "checkpoint.pt": checkpoint,
     "results": results, "config.json": settings, "merl-networks": networks, "synthesize": synthesized,
     "merl-table": merl, "ply": mesh(".ply"), "obj": mesh(".obj"),
     "stl": mesh(".stl"), "glb": mesh(".glb"),

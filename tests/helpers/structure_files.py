@@ -6,6 +6,7 @@ Photographs have different lenses and sizes. `projections` gives where each prog
 import json
 
 import numpy as np
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from helpers.photogrammetry_files import NAMES, POINTS, cameras, photographs, text_of
@@ -262,6 +263,28 @@ def record3d(folder, varying=True, edit=lambda metadata: None):
     edit(metadata)
     photographs(folder / "rgb", ["0.jpg", "1.jpg", "2.jpg"])
     (folder / "metadata.json").write_text(json.dumps(metadata))
+    return folder
+
+
+def sdfstudio(folder, edit=lambda metadata: None):
+    """The page on the data format. Matrices have OpenCV's axes; one of the intrinsics is 3 x 3, one has a mask."""
+    metadata = {"camera_model": "OPENCV", "height": 52, "width": 62, "has_mono_prior": True, "pairs": "pairs.txt",
+                "worldtogt": np.diag([2, 2, 2, 1]).tolist(), "frames": [],
+                "scene_box": {"aabb": [[-1, -1, -1], [1, 1, 1]], "near": 0.5, "far": 4.5, "radius": 1.0,
+                              "collider_type": "near_far"}}  # fmt: skip
+    for k, ((R, t), (fx, fy, cx, cy)) in enumerate(zip(cameras(), LENSES)):
+        K = np.array([[fx, -8e-5, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        pose = np.block([[R.T, (-R.T @ t)[:, None]], [np.eye(4)[3:]]])
+        metadata["frames"].append({
+            "rgb_path": f"{k:06}_rgb.png", "camtoworld": pose.tolist(),
+            "intrinsics": K[: 3 + k % 2, : 3 + k % 2].tolist(),
+            "mono_depth_path": f"{k:06}_depth.npy", "mono_normal_path": f"{k:06}_normal.npy",
+        })  # fmt: skip
+    metadata["frames"][1]["foreground_mask"] = "000001_foreground_mask.png"
+    edit(metadata)
+    photographs(folder, [f"{k:06}_rgb.png" for k in range(3)])
+    Image.new("L", (62, 52), 255).save(folder / "000001_foreground_mask.png")
+    (folder / "meta_data.json").write_text(json.dumps(metadata))
     return folder
 
 
