@@ -32,7 +32,7 @@ def help_by(argument, capsys):
 
 def test_help_shows_what_users_set_and_says_how_many_more_options_there_are(capsys):
     found, below = help_by("--help", capsys)
-    assert found["options"] == names(Task, Common) and len(found["options"]) == 15
+    assert found["options"] == names(Task, Common) and len(found["options"]) == 16
     assert set(found) <= {"positional arguments", "options"}
     everything, other = help_by("--help-all", capsys)
     assert everything["options"] == found["options"]

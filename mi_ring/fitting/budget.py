@@ -29,11 +29,11 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
     trial = Fit(fit.problem.given, fit.problem.config, terms=fit.loss.terms, state=fit.state())
     trial.ring.domain = fit.ring.domain  # it caches its samplings for the fit, too
     state, costs = trial.sampler.state(), {}
-    for stage in {(stage.level, stage.width): stage for stage in stages}.values():
+    for stage in {(stage.level, stage.width): stage for stage in stages if not stage.detail}.values():
         # A stage that shapes the surface: one with a fixed surface takes less time.
         last = trial.schedule.iterations
         trial.schedule = replace(trial.schedule, stages=(stage._replace(first=0, last=last, settles=False),))
-        trial.optimisation.settle(trial.schedule, trial.schedule.iterations - 2)
+        trial.optimisation.prepare(trial.schedule, trial.schedule.iterations - 2)
         for _ in range(2):
             if interrupted():
                 return {}
@@ -88,8 +88,20 @@ def seconds_of(config: Config, plan: Planner, costs: Costs) -> float:
     `plan`: a function from settings to the schedule of their fit. `costs`: a dict from (mesh level, photograph width)
     to measured seconds per iteration.
     """
-    iterations = sum((s.last - s.first) * costs[s.level, s.width] for s in plan(config).stages)
+    stages = plan(config).stages
+    iterations = sum((stage.last - stage.first) * seconds_per_iteration(stage, stages, costs) for stage in stages)
     return iterations + seconds_around(config, plan, costs)
+
+
+def seconds_per_iteration(stage: Stage, stages: Sequence[Stage], costs: Costs) -> float:
+    """Return the time [s] of an iteration of a stage, one of `stages`. `costs`: of the others; details are estimated.
+
+    An iteration for details takes as long as one of the stage before at a mesh level finer by 1, and half as long for
+    each level less: it has fewer photographs.
+    """
+    before = next(other for other in reversed(stages) if not other.detail) if stage.detail else stage
+    finer = 2.0 ** (stage.level - before.level - 1) if stage.detail else 1.0
+    return finer * costs[before.level, before.width]
 
 
 def seconds_around(config: Config, plan: Planner, costs: Costs) -> float:
@@ -98,5 +110,5 @@ def seconds_around(config: Config, plan: Planner, costs: Costs) -> float:
     `plan`: a function from settings to the schedule of their fit. `costs`: a dict from (mesh level, photograph width)
     to measured seconds per iteration.
     """
-    last = plan(config).stages[-1]
-    return AROUND * costs[last.level, last.width]
+    stages = plan(config).stages
+    return AROUND * seconds_per_iteration(stages[-1], stages, costs)

@@ -79,6 +79,10 @@ class Common:
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Parameters of the BSDF that the fit finds, each with its lowest and highest value (inf: no limit).
     Only needed if the BSDF of the scene is not cooktorrance. Example: --parameters base_color 0 1 roughness 0.05 1"""
+    detail: Literal["none", "texture", "shape", "both"] = "both"
+    """What the fit refines at the end, as fine as the pixels of the photographs. The networks alone are smooth.
+    texture: colour and gloss. shape: displacement of the surface. both: texture and shape.
+    none: neither, which takes less time."""
     holdout: int = 0
     """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.
     For example, 8 leaves out the fifth, the thirteenth, and so on. The fit then has fewer photographs.
@@ -111,6 +115,12 @@ class Tuning:
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
     mi-ring export can write other levels later."""
+    detail_share: float = 0.13
+    """Number of iterations for --detail, as a share of --iterations, which does not contain them.
+    There are no details if this gives fewer than 10 iterations."""
+    detail_rate: float = 0.1
+    """Learning rate of --detail. A value moves by this number at most in an iteration.
+    A displacement of 1 is as large as the distance of its values. For colour see --learning-rate."""
     batch: int = 8
     """Photographs in each iteration. More photographs make an iteration slower and its gradient less noisy."""
     steps: int = 3
@@ -214,8 +224,9 @@ class Config(Ablation, Tuning, Common):
         require(self.encoding != "octaves" or self.frequencies <= 16, "frequencies", "1 to 16 for octaves")
         require(0 <= self.seed < 2**63, "seed", "0 or more and below 2^63")
         require(0 <= self.laplacian_scale < math.inf, "laplacian_scale", "0 or more")
-        for name in ("learning_rate", "muon_rate", "decay", "velocity_decay"):
+        for name in ("learning_rate", "muon_rate", "decay", "velocity_decay", "detail_rate"):
             require(0 < getattr(self, name) < math.inf, name, "above 0")
+        require(0 <= self.detail_share < math.inf, "detail_share", "0 or more")
         require(self.holdout == 0 or self.holdout >= 2, "holdout", "0, or 2 or more")
         require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
         require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")
@@ -316,6 +327,7 @@ PRESETS: dict[str, dict] = {
     "fast": {
         "iterations": 140, "levels": (4, 5), "widths": (128, 256), "shares": (0.8, 0.2), "subdivisions": 5,
         "velocity_decay": 1.0,  # in so few iterations limbs are not yet in their places when it is weak
+        "detail": "none",
     },
     "default": {},
     "fine": {"iterations": 1400, "shares": (0.3, 0.4, 0.3)},
@@ -324,6 +336,6 @@ PRESETS: dict[str, dict] = {
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
         "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
         "precision": "float32", "domain": "sphere", "masks": "given", "shadows": False, "indirect": False,
-        "refine": ("none",),
+        "refine": ("none",), "detail": "none",
     },
 }  # fmt: skip

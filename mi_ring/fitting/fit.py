@@ -72,12 +72,12 @@ class Fit(Renamed):
         lighting, ring = (lighting, None) if state is None else restored(state)
         if config.deterministic:
             recompute_normals(capture.scene)
-        self.problem = Problem.of(capture, config, lighting or Lighting.of(capture, config))
+        self.problem = problem = Problem.of(capture, config, lighting or Lighting.of(capture, config))
         torch.manual_seed(config.seed)
-        self.model = Model(self.problem, (ring or starting_ring(self.problem, networks)).to(self.problem.device))
+        self.model = model = Model(problem, (ring or starting_ring(problem, networks)).to(problem.device))
         self.loss.require_velocity(self.ring.shape_net)
         settling = self.problem.lighting.kind in AMBIGUOUS and self.loss.weight("settling") > 0
-        self.plan: Callable[[Config], Schedule] = lambda config: Schedule.of(config, self.model.starts_near, settling)
+        self.plan = lambda config: Schedule.of(config, model.starts_near, settling, model.detail_levels)
         self.schedule = self.plan(config)
         self.sampler, self.renderer = Sampler(self.problem), Renderer(self.problem, self.ring)
         self.optimisation = Optimisation(self.problem, self.model, self.loss.terms)
@@ -85,7 +85,7 @@ class Fit(Renamed):
         self.capture = self.problem.capture  #: with the masks that are used now
         if state is not None:
             self.restore(copy.deepcopy(state))
-        self.optimisation.settle(self.schedule, self.iteration)
+        self.optimisation.prepare(self.schedule, self.iteration)
 
     def __iter__(self) -> Iterator[Iteration]:
         """Run the iterations that are left. Yields each iteration when it is done."""
@@ -112,7 +112,7 @@ class Fit(Renamed):
         it.prediction = it.prediction.detached()
         self.regulariser.note(it)
         self.course.iteration += 1
-        self.optimisation.settle(self.schedule, self.iteration)
+        self.optimisation.prepare(self.schedule, self.iteration)
         self.course.seconds += time.perf_counter() - started
         if it.number == it.stage.last:
             release_memory()  # what comes next has other sizes

@@ -77,7 +77,7 @@ class Iteration(renamed.Renamed):
 
         In a lit room only the object's pixels are compared, because the background is bright.
         """
-        return self.object_pixels() if self.context.capture.lit_room else None
+        return self.object_pixels() if self.context.capture.lit_room or self.stage.detail else None
 
     def outline_blur(self) -> float:
         """Return the standard deviation [px] of the Gaussian that blurs silhouettes in the mask loss."""

@@ -7,10 +7,14 @@ from torch import nn
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Capture
+from mi_ring.fitting.detail_stage import add_detail, detail_levels, pixels_per_unit, share_weights
 from mi_ring.fitting.lighting import room_frames
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import Refinement
 from mi_ring.geometry.domain import Sphere
+from mi_ring.nets.brdf_net import MaterialNet
+from mi_ring.nets.shape_net import Flow
+from mi_ring.objects.detail import DetailedFlow, DetailedMaterial
 from mi_ring.objects.fitted_object import FittedObject
 
 
@@ -33,6 +37,9 @@ class Model(nn.Module):
             self.calibration = Calibration(capture, refined, rig, room_frames(capture, lighting))
             self.calibration.room.to(problem.device)
         self.starts_near = not isinstance(ring.domain, Sphere)  #: from a hull or a mesh
+        self.resolution = pixels_per_unit(problem, center, float(ring.radius))  #: of the photographs
+        self.detail_levels = detail_levels(ring, self.resolution)  #: of the meshes for details, from coarse to fine
+        share_weights(ring)
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 
     def fix_surface(self, fixed: bool) -> None:
@@ -42,6 +49,22 @@ class Model(nn.Module):
         """
         for parameter in self.to_freeze:
             parameter.requires_grad_(not fixed)
+
+    @property
+    def detailed(self) -> bool:
+        """Return True if details have been added to the networks."""
+        return isinstance(self.ring.shape_net, DetailedFlow)
+
+    def add_detail(self, level: int) -> None:
+        """Add details, which are 0, to both networks, and freeze the networks. `level`: level of the finest mesh."""
+        add_detail(self.ring, level, self.resolution)
+
+    def remove_detail(self) -> tuple[Flow, MaterialNet]:
+        """Remove the details, and return the networks that had them: (Shape-Net, BRDF-Net)."""
+        shape, material = self.ring.shape_net, self.ring.brdf_net
+        if isinstance(shape, DetailedFlow) and isinstance(material, DetailedMaterial):
+            self.ring.shape_net, self.ring.brdf_net = shape.base.network, material.base.network
+        return shape, material
 
     def update_albedo(self) -> None:
         """Divide the object's reflectances by the current value of `scale`, the common factor of all lights.

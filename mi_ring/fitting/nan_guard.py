@@ -55,6 +55,7 @@ class NanGuard:
     def keep(self) -> None:
         """Copy the parameters and the optimiser states, which must be finite. The copy replaces the last one."""
         parts: list[Any] = [self.model, *self.optimizers]
+        self.copy: list[Any] = []  # frees the memory of the last copy
         self.copy, self.steps = copy.deepcopy([part.state_dict() for part in parts]), 0
 
     def state(self) -> dict[str, Any]:

@@ -9,7 +9,9 @@ from torch import Tensor, nn
 
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.errors import InputError
+from mi_ring.fitting.agreeing_adam import AgreeingAdam
 from mi_ring.fitting.config import Config
+from mi_ring.fitting.detail_stage import unfold
 from mi_ring.fitting.exposure_solver import ExposureSolver
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.model import Model
@@ -20,6 +22,7 @@ from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import START
 from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
 from mi_ring.fitting.terms import Term
+from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.machine import has_fast_bfloat16
 
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
@@ -54,6 +57,13 @@ def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepp
     return [Stepper(adam, [Rate(CALIBRATION_RATE, config.decay, START)] * len(groups))]
 
 
+def detail_steppers(ring: FittedObject, config: Config) -> list[Stepper]:
+    """Make the optimiser of the details."""
+    nets: dict[str, Any] = {"shape": ring.shape_net, "texture": ring.brdf_net}
+    chosen = [p for name, net in nets.items() if config.detail in (name, "both") for p in net.grid.parameters()]
+    return [Stepper(AgreeingAdam(chosen, config.detail_rate), [Rate(config.detail_rate, config.decay)])]
+
+
 @torch.no_grad()
 def solve_room(calibration: Calibration, it: Iteration) -> None:
     """Estimate the room's light, in place: add an iteration's photographs to the normal equations and solve them.
@@ -73,14 +83,22 @@ class Optimisation:
 
     def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
         """Make the optimisers and solvers for a model. `terms`: the terms of the loss by name."""
-        self.problem, self.model = problem, model
-        self.steppers = network_steppers(model.ring, problem.config, problem.device)
+        self.problem, self.model, self.terms = problem, model, terms
+        self.begin()
+
+    def begin(self) -> None:
+        """Make new optimisers and solvers for what the model learns now: the networks and calibration, or details."""
+        model, config = self.model, self.problem.config
         self.solvers: list[ExposureSolver | PoseSolver] = []  #: use more of an iteration than gradients
-        if calibration := model.calibration:
+        if model.detailed:
+            self.steppers = detail_steppers(model.ring, config)
+        else:
+            self.steppers = network_steppers(model.ring, config, self.problem.device)
+        if (calibration := model.calibration) and not model.detailed:
             self.solvers += [ExposureSolver(calibration, n) for n in ("power", "gain") if n in calibration.refined]
             if "cameras" in calibration.refined:
-                self.solvers.append(PoseSolver(calibration, model.starts_near, terms))
-            self.steppers += calibration_steppers(calibration, problem.config)
+                self.solvers.append(PoseSolver(calibration, model.starts_near, self.terms))
+            self.steppers += calibration_steppers(calibration, config)
             self.steppers += [Stepper(solver, [solver.rate]) for solver in self.solvers]
         self.optimizers = [stepper.optimizer for stepper in self.steppers]
         self.guard = NanGuard(model, self.optimizers)
@@ -93,7 +111,7 @@ class Optimisation:
         `mask` and they have no masks. Raises InputError if the fit diverges.
         """
         loss, it = evaluate()
-        if self.model.calibration:
+        if self.model.calibration and not it.stage.detail:
             solve_room(self.model.calibration, it)
         for solver in self.solvers:
             solver.look(it)
@@ -111,26 +129,39 @@ class Optimisation:
         healthy = bool((it.loss + norm).isfinite()) and all(bool(g.isfinite().all()) for g in others)
         for optimizer, rates, evaluates in self.steppers:
             for group, rate in zip(optimizer.param_groups, rates):
-                group["lr"] = learning_rate(rate, it.progress) * self.guard.factor
+                progress = it.batch.detail_progress if it.stage.detail else it.progress
+                group["lr"] = learning_rate(rate, progress) * self.guard.factor
             if healthy and evaluates:
                 optimizer.step(lambda: self.backward(*evaluate()))
             elif healthy:
                 optimizer.step()
         if not self.guard.note(healthy):
             option = "--muon-rate" if self.problem.config.optimizer == "muon" else "--learning-rate"
+            option = "--detail-rate" if it.stage.detail else option
             path = self.problem.capture.path
             wrong = ", ".join(name for name, value in it.terms.items() if not math.isfinite(value))
             raise InputError(f"{path}: diverged at iteration {it.number - 1}{' by the term ' * bool(wrong)}{wrong}; "
                              f"try a lower {option}")  # fmt: skip
-        self.model.update_albedo()
+        if not it.stage.detail:
+            self.model.update_albedo()
         return it
 
-    def settle(self, schedule: Schedule, iteration: int) -> None:
-        """Freeze the surface if `iteration`, counted from 0, is in the settling stage; otherwise let it move.
+    def prepare(self, schedule: Schedule, iteration: int) -> None:
+        """Prepare the model for the stage of `iteration`, counted from 0.
 
-        In the first iteration of the settling stage, this also empties the normal equations of the room's light.
+        Networks and calibration are trained first. In the settling stage the surface is frozen, and before its first
+        iteration the normal equations of the room's light are emptied. Then details are added and trained alone. At the
+        end of each stage they are smoothed where they fold the surface.
         """
-        fixed = schedule.shaping <= iteration < schedule.iterations
+        if iteration in [stage.last for stage in schedule.stages if stage.detail]:
+            unfold(self.model.ring, schedule.stage(iteration - 1).level)
+        stage = schedule.stage(min(iteration, schedule.iterations - 1))
+        if self.model.detailed or (stage.detail and iteration < schedule.iterations):
+            if not self.model.detailed:
+                self.model.add_detail(schedule.final_level)
+                self.begin()
+            return
+        fixed = stage.settles and iteration < schedule.iterations
         self.model.fix_surface(fixed)
         if fixed and iteration == schedule.shaping and self.model.calibration:
             self.model.calibration.room.forget()

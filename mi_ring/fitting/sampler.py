@@ -14,6 +14,7 @@ from mi_ring.fitting.schedule import Schedule, Stage
 from mi_ring.geometry.domain import Domain
 
 SEEDED = "renderer", "indirect", "regulariser"  #: get a seed in each batch
+RAYS = 2**20  #: of an iteration in which details are found
 PURPOSES = "photographs", "rotations", *SEEDED  #: of random generators
 
 
@@ -26,6 +27,7 @@ class Batch:
 
     number: int  #: of the iteration, from 1
     progress: float  #: share of the shaping iterations that are done, in [0, 1]; 1: the surface is fixed
+    detail_progress: float  #: share of the iterations for details that are done, in [0, 1]
     stage: Stage
     points: Tensor  #: (V, 3) domain points
     faces: np.ndarray  #: (F, 3)
@@ -60,14 +62,16 @@ class Sampler:
         `domain`: the start surface, from which points are drawn.
         """
         stage = schedule.stage(iteration)
-        points, faces = domain.sample(stage.level, self.random["rotations"] if problem.config.resample else None)
-        everyone, size = self.draw_photographs(problem.config.batch)
+        resample = problem.config.resample and not stage.detail
+        points, faces = domain.sample(stage.level, self.random["rotations"] if resample else None)
+        everyone, size = self.draw_photographs(problem.config.batch, RAYS // stage.width**2 if stage.detail else None)
         seeds = {name: int(torch.randint(2**31, (), generator=self.random[name])) for name in SEEDED}
         share = problem.processes.share(len(everyone))
-        return Batch(iteration + 1, schedule.progress(iteration), stage, points.to(problem.device), faces,
-                     everyone[share.part], everyone, size, -(-size[0] // stage.width), seeds, share)  # fmt: skip
+        return Batch(iteration + 1, schedule.progress(iteration), schedule.detail_progress(iteration), stage,
+                     points.to(problem.device), faces, everyone[share.part], everyone, size,
+                     -(-size[0] // stage.width), seeds, share)  # fmt: skip
 
-    def draw_photographs(self, count: int) -> tuple[np.ndarray, tuple[int, int]]:
+    def draw_photographs(self, count: int, most: int | None = None) -> tuple[np.ndarray, tuple[int, int]]:
         """Draw `count` photographs of one size, or all photographs of this size if there are fewer.
 
         Returns (their indices, their size (width, height) [px]).
@@ -75,7 +79,7 @@ class Sampler:
         random = self.random["photographs"]
         size = self.sizes[int(torch.randint(len(self.sizes), (), generator=random))]
         alike, waiting = self.alike[size], self.waiting.get(size, [])
-        count = min(count, len(alike))
+        count = min(count, len(alike), max(1, most or count))
         if len(waiting) < count:  # the remaining ones come first, and last in the next round
             order = alike[torch.randperm(len(alike), generator=random).numpy()].tolist()
             waiting = waiting + [k for k in order if k not in waiting] + waiting

@@ -10,6 +10,7 @@ from mi_ring.fitting.config import Config
 
 HEAD_START = 2 / 3  #: share of the first stage's iterations that a start near the object makes unnecessary
 EXCHANGE = 0.4  #: iterations of the second stage that replace one of the first: they take as long, with the presets
+FEWEST = 10  #: iterations for details: fewer do not show whether photographs agree
 SETTLING = 0.15  #: iterations of the settling stage, as a share of all iterations before it
 RAMP = 0.05  #: progress in which a learning rate rises from 0 to full, after its start
 MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
@@ -25,6 +26,7 @@ class Stage(NamedTuple):
     first: int  #: first iteration, from 0
     last: int  #: iteration after the last
     settles: bool = False  #: Is the surface fixed, while light and material settle?
+    detail: bool = False  #: Are networks and calibration fixed, while details are found?
 
 
 class Rate(NamedTuple):
@@ -50,11 +52,11 @@ class Schedule:
     stages: tuple[Stage, ...]
 
     @classmethod
-    def of(cls, config: Config, near: bool = False, settling: bool = False) -> "Schedule":
-        """Plan the stages of a fit with these settings. A stage without iterations is left out.
+    def of(cls, config: Config, near: bool = False, settling: bool = False, detail: Sequence[int] = ()) -> "Schedule":
+        """Plan the stages of a fit with these settings. Stages without iterations are left out.
 
-        `near`: the fit starts near the object's surface; its first stage is shorter. `settling`: add a last stage in
-        which the surface is fixed.
+        `near`: the fit starts near the object's surface; its first stage is shorter. `settling`: add a stage in which
+        the surface is fixed. `detail`: add stages in which details are found, on meshes of these levels.
         """
         shares = list(config.shares)
         if near and len(shares) > 1:
@@ -69,6 +71,13 @@ class Schedule:
         if settling:
             more = max(1, round(SETTLING * first))
             stages.append(Stage(config.levels[-1], config.widths[-1], first, first + more, settles=True))
+            first += more
+        more = round(config.detail_share * config.iterations)
+        finest = more // 3  # the rest is for coarser meshes
+        for level in detail if config.detail != "none" and more >= FEWEST else ():
+            last = first + (finest if level == detail[-1] else (more - finest) // max(1, len(detail) - 1))
+            stages.append(Stage(level, max(config.widths), first, last, detail=True))
+            first = last
         return cls(tuple(stage for stage in stages if stage.last > stage.first))
 
     @property
@@ -78,8 +87,8 @@ class Schedule:
 
     @property
     def shaping(self) -> int:
-        """Number of iterations that shape the surface: all but those of the settling stage."""
-        return self.stages[-1].first if self.stages[-1].settles else self.iterations
+        """Number of iterations that shape the surface: all before the settling stage and the details."""
+        return next((stage.first for stage in self.stages if stage.settles or stage.detail), self.iterations)
 
     @property
     def final_level(self) -> int:
@@ -100,6 +109,11 @@ class Schedule:
         It is the share of the iterations that shape the surface that are done. In the settling stage it is 1.
         """
         return min(1.0, iteration / self.shaping)
+
+    def detail_progress(self, iteration: int) -> float:
+        """Share, in [0, 1], of the iterations for details that are done before this one."""
+        first = next((stage.first for stage in self.stages if stage.detail), self.iterations)
+        return max(0, iteration - first) / max(1, self.iterations - first)
 
     def outline_blur(self, progress: float, width: float) -> float:
         """Return the standard deviation [px] of the blur of silhouettes in photographs `width` [px] wide.

@@ -66,7 +66,7 @@ def velocity(it: Iteration) -> Tensor | None:
 
     Returns None in the last stage, when the surface is fixed.
     """
-    if it.stage.settles:
+    if it.stage.settles or it.stage.detail:
         return None
     net = it.context.model.ring.shape_net
     random = torch.Generator().manual_seed(it.batch.seeds["regulariser"])

@@ -53,7 +53,7 @@ def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> 
     that. `before`: the same error with the capture's values for all unknowns. The last two are missing if no held-out
     photograph shows the object; `before` is also missing if nothing is refined.
     """
-    calibration = model.calibration
+    calibration, reset = model.calibration, []
 
     def now() -> float:
         model.update_albedo()
@@ -62,9 +62,15 @@ def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> 
     found = now()
     if math.isnan(found):
         return {"put_back": []}
+    if model.detailed:
+        detailed = model.remove_detail()
+        without = now()
+        if without <= found:
+            found, reset = without, ["detail"]
+        else:
+            model.ring.shape_net, model.ring.brdf_net = detailed
     if calibration is None:
-        return {"unexplained": found, "put_back": []}
-    reset: list[str] = []
+        return {"unexplained": found, "put_back": reset}
     for option in [option for option in calibration.refined if option not in PER_PHOTOGRAPH]:
         pairs = calibration.current_and_given(option)
         if all(torch.equal(current, given) for current, given in pairs):

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from mi_ring.objects.detail import DetailedFlow
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.optional import need
 
@@ -18,8 +19,9 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
 
     `s` (V, 3), `faces` (F, 3): a mesh of the domain. Shape-Net moves a point on the outer side of such a triangle to
     the inner side. For infinitely small triangles this means det ∂Φ/∂s ≤ 0, which is impossible for an exactly computed
-    flow.
+    flow. A triangle that details turn by more than 90° is inside out, too.
     """
+    flow = ring.shape_net.base.network if isinstance(ring.shape_net, DetailedFlow) else ring.shape_net
     s = s.to(ring.center.device)
     corners = torch.as_tensor(faces, device=s.device)
 
@@ -29,8 +31,9 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
 
     with torch.no_grad():
         centres, normals = s[corners].mean(1), F.normalize(crosses(s), dim=1)
-        outward = ring.shape_net(centres + STEP * normals) - ring.shape_net(centres - STEP * normals)
-        return ((crosses(ring.shape_net(s)) * outward).sum(1) <= 0).cpu().numpy()
+        outward = flow(centres + STEP * normals) - flow(centres - STEP * normals)
+        smooth = crosses(flow(s))
+        return (((smooth * outward).sum(1) <= 0) | ((smooth * crosses(ring.shape_net(s))).sum(1) <= 0)).cpu().numpy()
 
 
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -37,6 +37,11 @@ def qualified_name(network: type) -> tuple[str, str]:
     return network.__module__, network.__qualname__
 
 
+def is_registered(network: nn.Module) -> bool:
+    """Return True if the class of a network is registered, so that a file can hold the network."""
+    return any(qualified_name(type(network)) == qualified_name(known) for known in _networks.values())
+
+
 def architecture_of(network: nn.Module) -> dict:
     """Describe a network as plain data: a dict with its registered "name" and its constructor's "arguments", a dict.
 

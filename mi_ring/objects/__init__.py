@@ -1,4 +1,4 @@
-"""A fitted object (two networks and their domain), the file `ring.pt` that stores it, and edits of its material.
+"""A fitted object (networks, domain, details), the file `ring.pt` that stores it, and edits of its material.
 
-May import: mitsuba, numpy, torch, trimesh; rendering, scene, nets, geometry, system.
+May import: mitsuba, numpy, scipy, torch, trimesh; rendering, scene, nets, geometry, system.
 """

@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 import zipfile
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.nets import resnet  # noqa: F401  (registers it)
 from mi_ring.nets.registry import architecture_of, build
+from mi_ring.objects import detail  # noqa: F401  (registers its networks)
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.files import is_sealed
 from mi_ring.version import __version__
@@ -36,6 +38,13 @@ def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
         "bsdf": ring.bsdf, "indirect": ring.indirect, "subdivisions": ring.subdivisions, "config": config or {},
         "up": ring.up, "metres": ring.metres,
     }  # fmt: skip
+
+
+def compact(state: dict) -> dict:
+    """Return a copy of a result of `ring_state` in which details have 16 bits. Their rounding is below their noise."""
+    networks = state["networks"].items()
+    half = {name: value.half() for name, value in networks if re.search(r"\.grid\.values\.|\.directions\d", name)}
+    return state | {"networks": state["networks"] | half}
 
 
 def ring_of(state: dict) -> FittedObject:

@@ -14,7 +14,7 @@ from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml, remask
 from mi_ring.errors import InputError
 from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes, write_image
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.ring_file import ring_state
+from mi_ring.objects.ring_file import compact, ring_state
 from mi_ring.output import calibration_panel, gltf, report
 from mi_ring.output.fit_result import FitResult
 from mi_ring.output.ply import write_mesh
@@ -162,7 +162,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     scene file (XML) with the fitted object and the given calibration; this function puts in what the fit refined.
     """
     ring, capture = result.ring, result.capture
-    write_state(ring_state(ring, result.settings), folder / "ring.pt")
+    write_state(compact(ring_state(ring, result.settings)), folder / "ring.pt")
     views = capture.views
     unseen = write_mesh(ring, ring.subdivisions, folder / "mesh.ply", views=views)
     if result.summary:

@@ -1,0 +1,214 @@
+"""What is finer than the networks: functions of domain points on grids, added to Shape-Net and BRDF-Net.
+
+The grids are those of "Instant Neural Graphics Primitives" (Müller et al. 2022) without hashing and without a network:
+only cubes that the domain passes have values.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from mi_ring.nets.brdf_net import MaterialNet
+from mi_ring.nets.registry import architecture_of, build, register_network
+from mi_ring.nets.shape_net import Flow
+
+CORNERS = torch.tensor(list(itertools.product((0, 1), repeat=3)))  #: (8, 3) of a cube
+AT_ONCE = 2**16  #: points whose weights are computed at once
+BITS, MOST = 21, 2**20  #: a key holds three coordinates of 21 bits, counted from -`MOST`
+
+
+class Grid(nn.Module):
+    """A function of points in ℝ³: a sum of octaves, from coarse to fine. Each is trilinear on cubes.
+
+    `cell`: side of the finest cubes; those of each coarser octave are twice as large. `nodes`: number of corners that
+    have values, for each octave. `channels`: of the values, initially 0.
+    """
+
+    def __init__(self, cell: float, nodes: Sequence[int], channels: int) -> None:
+        super().__init__()
+        self.cells = [cell * 2**k for k in reversed(range(len(nodes)))]
+        for k, n in enumerate(nodes):
+            self.register_buffer(f"keys{k}", torch.zeros(n, dtype=torch.long))
+        self.values = nn.ParameterList(nn.Parameter(torch.zeros(n, channels)) for n in nodes)
+        self.latest: list[tuple[Tensor, list[scipy.sparse.csr_matrix]]] = []  #: the last points, and their weights
+
+    @classmethod
+    def around(cls, points: Tensor, cell: float, octaves: int, channels: int) -> "Grid":
+        """Make a grid whose cubes contain the points (V, 3)."""
+        keys = []
+        for k in reversed(range(octaves)):
+            cubes = torch.unique(torch.floor(points.double() / (cell * 2**k)).long(), dim=0)
+            keys.append(torch.unique(key_of(cubes[:, None] + CORNERS)))
+        grid = cls(cell, [len(own) for own in keys], channels)
+        for k, own in enumerate(keys):
+            getattr(grid, f"keys{k}").copy_(own)
+        return grid
+
+    def keys(self, octave: int) -> Tensor:
+        """The sorted keys (N,) of an octave's corners."""
+        return getattr(self, f"keys{octave}")
+
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor."""
+        return {"cell": self.cells[-1], "nodes": [len(v) for v in self.values], "channels": self.values[0].shape[1]}
+
+    def weights(self, s: Tensor) -> list[scipy.sparse.csr_matrix]:
+        """Return the weights (V, N) of the corners at points (V, 3), for each octave. The last result is kept.
+
+        The eight corners around a point have weights above 0. A corner without a value has none.
+        """
+        for points, weights in self.latest:
+            if points.data_ptr() == s.data_ptr() and points.shape == s.shape:
+                return weights
+        self.latest.clear()
+        found = []
+        for k in range(len(self.values)):
+            parts = [self.octave_weights(part, k) for part in s.detach().cpu().split(AT_ONCE)]
+            found.append(scipy.sparse.vstack(parts, "csr"))
+        self.latest.append((s.detach(), found))
+        return found
+
+    def share(self, other: "Grid") -> None:
+        """Use the same memory for weights as `other`, a grid with the same corners."""
+        self.latest = other.latest
+
+    def octave_weights(self, s: Tensor, octave: int) -> scipy.sparse.csr_matrix:
+        """Return the weights (V, N) of one octave at points (V, 3), see `weights`."""
+        keys, at = self.keys(octave).cpu(), s.double() / self.cells[octave]
+        cube = torch.floor(at)
+        key = key_of(cube.long()[:, None] + CORNERS)
+        place = torch.searchsorted(keys, key).clamp(max=len(keys) - 1)
+        share = (at - cube)[:, None]
+        weight = torch.where(CORNERS == 1, share, 1 - share).prod(-1) * (keys[place] == key)
+        weight /= weight.sum(1, keepdim=True).clamp(min=0.5)  # small parts of the domain are in cubes without values
+        rows = np.arange(0, 8 * len(s) + 1, 8, dtype=np.int32)
+        parts = weight.float().numpy().ravel(), place.int().numpy().ravel(), rows
+        return scipy.sparse.csr_matrix(parts, (len(s), len(keys)))
+
+    def forward(self, s: Tensor, values: Sequence[Tensor] | None = None) -> Tensor:
+        """Interpolate at points (V, 3): (V, channels). `values` (N, channels) of each octave replace the grid's own."""
+        several = zip(self.weights(s), self.values if values is None else values)
+        return torch.stack([_Product.apply(own, weights) for weights, own in several]).sum(0)
+
+
+class _Product(torch.autograd.Function):
+    """A sparse matrix times dense values."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, matrix: scipy.sparse.csr_matrix) -> Tensor:
+        ctx.matrix = matrix
+        return torch.from_numpy(matrix @ values.numpy(force=True)).to(values.device)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return torch.from_numpy(ctx.matrix.T @ gradient.numpy(force=True)).to(gradient.device), None
+
+
+def key_of(corners: Tensor) -> Tensor:
+    """One integer for three, (..., 3), in lexicographic order."""
+    x, y, z = (corners.clamp(-MOST, MOST - 1) + MOST).unbind(-1)
+    return (x << 2 * BITS) + (y << BITS) + z
+
+
+class Remembered(nn.Module):
+    """A network without gradients that remembers its last result: a fit of details asks for the same points again.
+
+    It always computes in float32: the rounding of bfloat16 would be as large as details.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network: Any = network.requires_grad_(False)
+        self.last: tuple[Tensor, Any, Tensor] | None = None  #: points, further argument, result
+
+    def __call__(self, function: Any, s: Tensor, *more: float) -> Tensor:
+        """Return `function(s, *more)`."""
+        last = self.last
+        if last is None or last[0].data_ptr() != s.data_ptr() or last[0].shape != s.shape or last[1] != more:
+            with torch.no_grad(), torch.autocast(s.device.type, enabled=False):
+                self.last = last = s.detach(), more, function(s, *more)
+        return last[2]
+
+
+@register_network("detailed-flow")
+class DetailedFlow(Flow):
+    """A flow, and a displacement of its end points along given directions.
+
+    Each corner of the grid has a direction. Its values are displacements in sides of the octave's cubes.
+    """
+
+    base: "Remembered"
+    grid: Grid
+
+    def __init__(self, flow: dict, grid: dict) -> None:
+        """Make a flow without displacement. `flow`: result of `architecture_of`. `grid`: arguments of `Grid`."""
+        super().__init__()
+        self.base, self.grid = Remembered(build(flow)), Grid(**grid)
+        self.steps = self.base.network.steps
+        for k, n in enumerate(grid["nodes"]):
+            self.register_buffer(f"directions{k}", torch.zeros(n, 3))
+
+    @classmethod
+    def of(cls, flow: Flow, grid: Grid, points: Tensor, normals: Tensor) -> "DetailedFlow":
+        """Add a displacement to `flow`, along the `normals` (V, 3) of its surface at domain `points` (V, 3)."""
+        detailed = cls(architecture_of(flow), grid.arguments())
+        detailed.base, detailed.grid = Remembered(flow), grid
+        for k, weights in enumerate(grid.weights(points)):
+            mean = torch.from_numpy(weights.T @ normals.numpy(force=True))
+            getattr(detailed, f"directions{k}").copy_(nn.functional.normalize(mean, dim=1))
+        return detailed
+
+    def arguments(self) -> dict:
+        """The arguments of the constructor."""
+        return {"flow": architecture_of(self.base.network), "grid": self.grid.arguments()}
+
+    def velocity_of(self, step: int) -> Any:
+        return self.base.network.velocity_of(step)
+
+    def velocity(self, x: Tensor) -> Tensor:
+        return self.base.network.velocity(x)
+
+    def flow(self, x: Tensor, steps: int) -> Tensor:
+        return self.base.network.flow(x, steps)
+
+    def forward(self, x: Tensor, time: float = 1.0) -> Tensor:
+        """Φ(x, time) for points (V, 3), displaced by the share `time` of the full displacement."""
+        vectors = [cell * own * getattr(self, f"directions{k}")
+                   for k, (cell, own) in enumerate(zip(self.grid.cells, self.grid.values))]  # fmt: skip
+        return self.base(self.base.network, x, time) + time * self.grid(x, vectors)
+
+
+@register_network("detailed-material")
+class DetailedMaterial(MaterialNet):
+    """A BRDF-Net, and what a grid adds to its outputs before these are mapped to the ranges of the parameters."""
+
+    base: "Remembered"
+    grid: Grid
+
+    def __init__(self, net: dict, grid: dict) -> None:
+        """Make a network whose grid adds 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`."""
+        made = build(net)
+        super().__init__(made.bsdf_parameters)
+        self.base, self.grid = Remembered(made), Grid(**grid)
+
+    @classmethod
+    def of(cls, net: MaterialNet, grid: Grid) -> "DetailedMaterial":
+        """Add a grid to `net`."""
+        detailed = cls(architecture_of(net), grid.arguments())
+        detailed.base, detailed.grid = Remembered(net), grid
+        detailed.set_parameters(net.bsdf_parameters, float(net.scale))
+        return detailed
+
+    def arguments(self) -> dict:
+        """The arguments of the constructor."""
+        return {"net": architecture_of(self.base.network), "grid": self.grid.arguments()}
+
+    def evaluate(self, s: Tensor) -> Tensor:
+        return self.base(self.base.network.evaluate, s).float() + self.grid(s)

@@ -1,0 +1,300 @@
+"""Details: grids that are added to the networks."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from mi_ring.capture.loading import load_capture
+from mi_ring.fitting.agreeing_adam import AgreeingAdam
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.detail_stage import add_detail, detail_levels, unfold
+from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.schedule import Schedule
+from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.metrics.embedding import inside_out
+from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import compact, ring_of, ring_state
+from mi_ring.system.machine import set_threads
+
+
+def points_near(n=500, seed=0):
+    return torch.nn.functional.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)), dim=1)
+
+
+def grid_of(channels=2, cell=0.11, octaves=3):
+    return Grid.around(points_near(), cell, octaves, channels)
+
+
+def corner_places(grid, octave):
+    """Where the corners of an octave are, (N, 3), by their keys."""
+    keys = grid.keys(octave)
+    whole = torch.stack([keys >> 42, (keys >> 21) % 2**21, keys % 2**21], 1) - 2**20
+    return whole * grid.cells[octave]
+
+
+def test_each_octave_reproduces_linear_functions():
+    grid, s = grid_of(), points_near()
+    for octave in range(3):
+        slope = torch.tensor([[0.3, -1.0], [2.0, 0.5], [-0.7, 0.1]])
+        for k in range(3):
+            grid.values[k].data.zero_()
+        grid.values[octave].data = corner_places(grid, octave) @ slope
+        assert torch.allclose(grid(s), s @ slope, atol=1e-5)
+
+
+def test_a_constant_is_reproduced_also_where_a_corner_is_missing():
+    grid = Grid.around(Sphere().sample(5)[0], 0.11, 3, 1)
+    for k in range(3):
+        grid.values[k].data.fill_(1.0)
+    lacking = np.array([(weights.astype(bool).sum(1) < 8).mean() for weights in grid.weights(points_near())])
+    assert lacking[-1] > 0
+    assert torch.allclose(grid(points_near()), torch.tensor(3.0))
+
+
+def test_cubes_halve_and_points_beside_them_have_no_value():
+    grid = grid_of()
+    assert grid.cells == pytest.approx([0.44, 0.22, 0.11])
+    for k in range(3):
+        grid.values[k].data.fill_(1.0)
+    assert torch.allclose(grid(points_near()), torch.tensor(3.0))
+    assert not grid(3 * points_near()).any()
+    assert not grid(1e9 * points_near()).any()
+
+
+def test_gradients_are_those_of_finite_differences():
+    grid, s = grid_of(), points_near(40)
+    target = torch.randn(40, 2)
+    (grid(s) * target).sum().backward()
+    values = grid.values[1]
+    for node in (int(values.grad.abs().sum(1).argmax()), int(values.grad.abs().sum(1).argsort()[-7])):
+        with torch.no_grad():
+            values[node, 1] += 0.5
+            up = float((grid(s) * target).sum())
+            values[node, 1] -= 1.0
+            down = float((grid(s) * target).sum())
+            values[node, 1] += 0.5
+        assert float(values.grad[node, 1]) == pytest.approx(up - down, rel=1e-3)
+
+
+def small(level=4):
+    torch.manual_seed(1)
+    ring = FittedObject((1.0, 2.0, 3.0), 2.0)
+    with torch.no_grad():
+        for parameter in ring.parameters():
+            parameter += 0.02 * torch.randn_like(parameter)
+    return ring
+
+
+def test_without_values_nothing_changes_and_networks_are_fixed():
+    ring, s = small(), points_near()
+    before = ring(s)
+    add_detail(ring, 4, 20)
+    after = ring(s)
+    assert torch.equal(before[0], after[0])
+    assert all(torch.equal(before[1][name], after[1][name]) for name in before[1])
+    assert ring.subdivisions == 4
+    free = {name for name, p in ring.named_parameters() if p.requires_grad}
+    assert free == {name for name, _ in ring.named_parameters() if ".grid." in name}
+
+
+def test_displacement_is_along_the_normal_in_cells():
+    ring = small()
+    s, faces = ring.domain.sample(4)
+    before = ring.surface(s).detach()
+    add_detail(ring, 4, 20)
+    ring.shape_net.grid.values[-1].data.fill_(0.5)
+    moved = (ring.surface(s).detach() - before) / float(ring.radius)
+    normals = trimesh.Trimesh(before.numpy(), faces, process=False).vertex_normals
+    assert torch.allclose(moved.norm(dim=1), torch.tensor(0.5 * ring.shape_net.grid.cells[-1]), rtol=0.03)
+    assert ((moved.numpy() * normals).sum(1) / moved.norm(dim=1).numpy()).min() > 0.97
+    half = (ring.surface(s, 0.5) - ring.to_scene(ring.shape_net.base.network(s, 0.5))) / ring.radius
+    assert torch.allclose(half, moved / 2, atol=1e-5)
+
+
+def test_material_stays_in_its_range():
+    ring, s = small(), points_near()
+    add_detail(ring, 4, 20)
+    for values in ring.brdf_net.grid.values:
+        values.data = 3 * torch.randn(values.shape)
+    found = ring.material(s)
+    assert found["roughness"].min() >= 0
+    assert found["roughness"].max() <= 1
+    assert found["diffuse"].min() >= 0
+    raw = ring.brdf_net.base.network.evaluate(s) + ring.brdf_net.grid(s)
+    assert torch.allclose(found["diffuse"], float(ring.brdf_net.scale) * torch.log1p(raw[:, :3].exp()), rtol=1e-4)
+
+
+def test_a_file_holds_details():
+    ring, s = small(), points_near()
+    add_detail(ring, 4, 20)
+    for grid in (ring.shape_net.grid, ring.brdf_net.grid):
+        for values in grid.values:
+            values.data = torch.randn(values.shape)
+    again = ring_of(ring_state(ring))
+    assert isinstance(again.shape_net, DetailedFlow)
+    assert isinstance(again.brdf_net, DetailedMaterial)
+    for a, b in zip((ring.surface(s), *ring.material(s).values()), (again.surface(s), *again.material(s).values())):
+        assert torch.equal(a, b)
+    assert again.subdivisions == 4
+    rounded = ring_of(compact(ring_state(ring)))
+    assert all(len(values.unique()) < 2**16 for values in rounded.shape_net.grid.values)
+    worst = (ring.surface(s) - rounded.surface(s)).norm(dim=1).max()
+    assert 0 < worst < 2e-3 * ring.shape_net.grid.cells[0] * float(ring.radius)
+
+
+@pytest.mark.parametrize("resolution", [10, 55, 220])
+def test_the_finest_mesh_has_about_a_vertex_for_each_pixel(resolution):
+    coarse, fine = detail_levels(small(), resolution)
+    assert fine == coarse + 1
+    spacing = math.sqrt(4 * math.pi / (10 * 4**fine)) * resolution
+    assert 0.6 < spacing < 2.4
+
+
+def test_levels_end_at_eight():
+    assert detail_levels(small(), 5000) == [7, 8]
+
+
+def test_networks_that_no_file_can_hold_get_no_details():
+    class Own(torch.nn.Module):
+        pass
+
+    ring = small()
+    ring.brdf_net = Own()
+    assert detail_levels(ring, 100) == []
+
+
+def test_a_stretched_domain_has_smaller_cells():
+    sphere = Sphere()
+    tall = Domain(sphere.sample(3)[0].numpy() * np.array([1, 1, 3], np.float32), sphere.sample(3)[1])
+    torch.manual_seed(0)
+    ring = FittedObject((0.0, 0.0, 0.0), 1.0, domain=tall)
+    add_detail(ring, 4, 20)
+    assert ring.shape_net.grid.cells[-1] == pytest.approx(1.25 / 20, rel=0.05)
+
+
+def descend(gradients, **options):
+    """Values after steps with these gradients (T, N)."""
+    values = torch.nn.Parameter(torch.zeros(gradients.shape[1]))
+    optimizer = AgreeingAdam([values], lr=0.01, **options)
+    for values.grad in gradients:
+        optimizer.step()
+    return values.detach()
+
+
+def test_values_move_where_gradients_agree_and_stay_where_they_do_not():
+    torch.manual_seed(0)
+    noise = torch.randn(200, 1000)
+    moved = descend(noise, doubt=2.0)
+    steady = descend(torch.full((200, 3), -1.0) * torch.tensor([1e-9, 1.0, 1e6]), doubt=2.0)
+    assert torch.allclose(steady, steady[1])  # whatever the scale
+    # The first steps wait: until then one sign says nothing. Later each is lr (1 - doubt σ), σ² = (1 - β) / (1 + β).
+    deviation = [math.sqrt(0.1 / 1.9 * (1 + 0.9**t) / (1 - 0.9**t)) for t in range(1, 201)]
+    assert float(steady[1]) == pytest.approx(0.01 * sum(max(0, 1 - 2 * d) for d in deviation), rel=1e-4)
+    assert moved.abs().mean() < 0.05 * steady[1]
+
+
+def test_iterations_that_do_not_show_a_value_change_nothing_of_it():
+    often = torch.sign(torch.randn(40, 5, generator=torch.Generator().manual_seed(3)) + 0.5)
+    seldom = torch.zeros(120, 5)
+    seldom[::3] = often
+    assert torch.equal(descend(often), descend(seldom))
+
+
+def test_adam_without_doubt():
+    gradients = torch.randn(50, 20, generator=torch.Generator().manual_seed(4)) + 1
+    values = torch.nn.Parameter(torch.zeros(20))
+    adam = torch.optim.Adam([values], lr=0.01, betas=(0.9, 0.99), eps=1e-12)
+    for values.grad in gradients:
+        adam.step()
+    ours = descend(gradients, doubt=0.0)
+    assert torch.allclose(ours, values.detach(), atol=0.02)  # its steps are not cut off at lr
+    assert (values.detach() < -0.1).all()
+
+
+def test_folds_are_smoothed_and_nothing_else():
+    ring = small()
+    add_detail(ring, 4, 20)
+    s, faces = ring.domain.sample(4)
+    values = ring.shape_net.grid.values[-1]
+    values.data[:] = 0.05 * torch.randn(values.shape, generator=torch.Generator().manual_seed(2))
+    gentle = values.detach().clone()
+    unfold(ring, 4)
+    assert torch.equal(values, gentle)
+    peak = int(ring.shape_net.grid.weights(s)[-1].sum(0).argmax())
+    values.data[peak] = 40
+    assert inside_out(ring, s, faces).any()
+    unfold(ring, 4)
+    assert not inside_out(ring, s, faces).any()
+    assert abs(float(values[peak].detach())) < 20
+    assert (values == gentle)[:, 0].float().mean() > 0.9
+    normals = trimesh.Trimesh(ring.shape_net(s).detach().numpy(), faces, process=False).face_normals
+    smooth = trimesh.Trimesh(ring.shape_net.base.network(s).detach().numpy(), faces, process=False).face_normals
+    assert (normals * smooth).sum(1).min() >= 0.2 - 1e-5
+
+
+def test_details_come_last_and_only_if_photographs_can_agree():
+    stages = Schedule.of(Config(iterations=100, detail_share=0.31), settling=True, detail=[6, 7]).stages
+    assert [stage.detail for stage in stages[-3:]] == [False, True, True]
+    assert stages[-3].settles
+    assert [(stage.level, stage.last - stage.first) for stage in stages[-2:]] == [(6, 21), (7, 10)]
+    for none in (Config(iterations=100, detail_share=0.09), Config(iterations=100, detail="none")):
+        assert not any(stage.detail for stage in Schedule.of(none, detail=[6, 7]).stages)
+    schedule = Schedule(stages)
+    first = stages[-2].first
+    assert [schedule.detail_progress(k) for k in (0, first, schedule.iterations)] == [0, 0, 1]
+    assert schedule.progress(first) == 1
+
+
+SMALL = Config(iterations=24, levels=(2,), widths=(32,), shares=(1.0,), detail_share=0.5, batch=4, deterministic=True,
+               subdivisions=3, domain="sphere")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def detailed(small_capture):
+    set_threads(1)
+    fit = Fit(load_capture(small_capture), SMALL)
+    states = {}
+    for it in fit:
+        if it.number in (24, 31):
+            states[it.number] = fit.state()
+    return fit, states
+
+
+def test_a_fit_with_details_goes_on_where_it_stopped(detailed, small_capture):
+    fit, states = detailed
+    for number, state in states.items():
+        again = Fit(load_capture(small_capture), SMALL, state=state)
+        assert again.iteration == number
+        again.run()
+        found, expected = again.ring.state_dict(), fit.ring.state_dict()
+        assert found.keys() == expected.keys()
+        assert all(torch.equal(found[name], expected[name]) for name in found)
+
+
+def test_the_networks_stay_as_they_were(detailed, small_capture):
+    fit, _ = detailed
+    alone = Fit(load_capture(small_capture), dataclasses.replace(SMALL, detail="none"))
+    alone.run()
+    for name, value in alone.ring.shape_net.state_dict().items():
+        assert torch.equal(value, fit.ring.shape_net.base.network.state_dict()[name])
+    assert any(values.any() for values in fit.ring.brdf_net.grid.values)
+
+
+@pytest.mark.parametrize("kind", ["texture", "shape"])
+def test_one_of_the_two(kind, small_capture):
+    fit = Fit(load_capture(small_capture), dataclasses.replace(SMALL, detail=kind))
+    fit.run()
+    shape, texture = (any(v.any() for v in net.grid.values) for net in (fit.ring.shape_net, fit.ring.brdf_net))
+    assert (shape, texture) == (kind == "shape", kind == "texture")
+
+
+def test_details_that_do_not_help_are_removed(small_capture):
+    fit = Fit(load_capture(small_capture), dataclasses.replace(SMALL, holdout=3, detail_rate=5.0))
+    fit.run()
+    assert "detail" in fit.course.validation["put_back"]
+    assert not fit.model.detailed
