@@ -114,6 +114,7 @@ class Tuning:
     mesh skips two thirds of the iterations of the first stage. It adds 40 % of the skipped iterations to the second."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
+    A fit with --detail chooses the level itself, 7 or 8 for most captures.
     mi-ring export can write other levels later."""
     detail_share: float = 0.13
     """Number of iterations for --detail, as a share of --iterations, which does not contain them.
