@@ -63,10 +63,11 @@ class PhotosConfig:
     """Folder to write: scene.xml, its files, and work/ with intermediate results.
     After an interruption, give the same command again: it continues from work/."""
     flash_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of the flash relative to the lens: right, down, forward. 30 -60 0: 30 mm to the right, 60 mm above.
-    The unit is the millimetre. If there is no printed sheet, it is the median distance from the cameras to the object.
+    """Position of the flash relative to the lens: right, down, forward. 30 -60 0: 30 to the right, 60 above.
+    With the printed sheet, give millimetres; the command then refines this position.
+    Without the sheet, give fractions of the median distance from the cameras to the object, for example 0.06 -0.12 0.
     Measure while you hold the camera as in most photographs. For photographs with the camera on its side, the command
-    turns the flash with the camera. If the photographs show the printed sheet, the command refines the position."""
+    turns the flash with the camera."""
     turntable: bool = False
     """Set this option if the object turned on a turntable while camera and flash stood still.
     The printed sheet of `mi-ring board` must lie under the object and turn with it."""

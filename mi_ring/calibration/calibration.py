@@ -67,7 +67,10 @@ class Calibration(nn.Module):
         self.room = RoomLight(room, rig.exposure, frames, alone)
 
     def value(self, name: str) -> Tensor:
-        """Return the current value of the unknown `name` in its own unit; 0 if the fit does not refine it."""
+        """Return the current correction of one kind of calibration parameter, in the parameter's unit.
+
+        `name`: a key of `UNKNOWNS`. Returns a scalar 0 if the fit does not refine it.
+        """
         return getattr(self, name) * self.widths[name] if name in self.widths else torch.zeros(())
 
     def estimate(self) -> Estimate:

@@ -30,7 +30,7 @@ class Estimate:
     response: CameraResponse
 
     def seen(self, **views: Tensor) -> "Estimate":
-        """Return a copy with other cameras. `views`: new tensors by name of the field, for example `distortion=…`."""
+        """Return a copy in which some fields of `self.views` are replaced, for example `seen(distortion=…)`."""
         return replace(self, views=self.views._replace(**views))
 
 

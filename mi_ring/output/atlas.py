@@ -86,8 +86,8 @@ def assemble(
 ) -> Atlas:
     """Compute positions, normals and tangents of a mesh that has texture coordinates. Returns the complete atlas.
 
-    `s` (V, 3): points of the domain, one for each vertex. `uv` (V, 2): texture coordinates. `faces` (F, 3): triangles.
-    `subdivisions`: level of the mesh, only stored. `time`: state of the deformation, from 0 (start surface) to 1
+    `s` (V, 3): points of the start surface, one for each vertex; Shape-Net deforms them into the object. `uv` (V, 2):
+    texture coordinates. `faces` (F, 3): triangles. `subdivisions`: level of this mesh, which the atlas keeps. `time`: state of the deformation, from 0 (start surface) to 1
     (fitted object).
     """
     points, normals, uncut = seamless_surface(ring, s, faces, time)

@@ -124,12 +124,13 @@ def calibrate_flash(
     The dictionaries have names of photographs as keys. `papers`: samples of the paper. `poses`: camera-to-world (4, 4),
     in the sheet's frame [mm]. `axes`: rotations (3, 3) from the axes of `offset` to the pixel axes of the photograph.
     `exposures`: relative exposures, NaN if unknown. `offset` (3,): approximate position of the flash relative to the
-    lens [mm]. `sphere`: stands for the object; None: no object. `curved`: True: also estimate the camera's response;
+    lens [mm]. `sphere`: a sphere in place of the object, which shades the sheet; None: no object. `curved`: True: also estimate the camera's response;
     False: it is linear.
 
-    The method is robust least squares of log brightness, with priors. It estimates what all photographs share, and the
-    intensity of each photograph. Samples in the margin are used only if they are as bright as the squares. If the
-    response is nearly linear, it is set to linear.
+    The method is robust least squares of log brightness, with priors. It estimates the position and falloff of the
+    flash and the camera's response, which all photographs share, and the intensity of each photograph. The sheet is
+    white in the squares of its pattern and in the margin around it. Samples in the margin are used only if they are as
+    bright as those in the squares. If the response is nearly linear, it is set to linear.
     """
     names = [n for n in papers if n in poses and not papers[n].in_margin.all() and poses[n][2, 3] > 0]
     if not names:

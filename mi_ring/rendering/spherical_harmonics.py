@@ -111,7 +111,10 @@ def evaluated_harmonics(direction, to_world, which: Sequence[int]) -> list:
 
 
 def to_camera_axes(direction, to_world):
-    """Convert a direction from world to camera coordinates. `to_world`: pose of the camera."""
+    """Convert directions (mi.Vector3f) from world to camera coordinates. Returns a mi.Vector3f.
+
+    `to_world`: camera-to-world transform of each direction, a mi.Transform4f or its matrix.
+    """
     return mi.Vector3f(*(dr.dot(mi.Vector3f(*(to_world[j, i] for j in range(3))), direction) for i in range(3)))
 
 
