@@ -117,7 +117,7 @@ class Tuning:
     A fit with --detail chooses the level itself, 7 or 8 for most captures.
     mi-ring export can write other levels later."""
     detail_share: float = 0.13
-    """Number of iterations that --detail adds at the end, as a share of --iterations. 0.13 of 1000: 130 more iterations.
+    """Number of iterations that --detail adds at the end, as a share of --iterations. 0.13 of 1000: 130 more.
     Raise it if fine texture or relief is still blurred. With fewer than 10 such iterations there are no details."""
     detail_rate: float = 0.1
     """Learning rate of --detail. A value moves by this number at most in an iteration.

@@ -42,9 +42,8 @@ def evaluate(
     the numbers `aligned_…` describe this motion. None: no alignment.
 
     Numbers that end in `_input` are about fitted photographs, those in `_held_out` about held-out photographs, those in
-    `_novel` about `novel`. Two entries are no numbers: `views` and `novel_views` are lists of dicts, one dict of numbers
-    for each photograph. A number that is
-    not defined, such as the genus of an open mesh, is missing.
+    `_novel` about `novel`. Two entries are no numbers: `views` and `novel_views` are lists of dicts, one dict for each
+    photograph. A number that is not defined, such as the genus of an open mesh, is missing.
     """
     if spp < 1:
         raise InputError(f"--spp: is {spp}, must be at least 1")

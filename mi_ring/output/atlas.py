@@ -87,8 +87,8 @@ def assemble(
     """Compute positions, normals and tangents of a mesh that has texture coordinates. Returns the complete atlas.
 
     `s` (V, 3): points of the start surface, one for each vertex; Shape-Net deforms them into the object. `uv` (V, 2):
-    texture coordinates. `faces` (F, 3): triangles. `subdivisions`: level of this mesh, which the atlas keeps. `time`: state of the deformation, from 0 (start surface) to 1
-    (fitted object).
+    texture coordinates. `faces` (F, 3): triangles. `subdivisions`: level of this mesh, which the atlas keeps. `time`:
+    state of the deformation, from 0 (start surface) to 1 (fitted object).
     """
     points, normals, uncut = seamless_surface(ring, s, faces, time)
     # The derivative of the position with respect to u: constant on a triangle, at vertices the mean weighted by area.

@@ -124,8 +124,8 @@ def calibrate_flash(
     The dictionaries have names of photographs as keys. `papers`: samples of the paper. `poses`: camera-to-world (4, 4),
     in the sheet's frame [mm]. `axes`: rotations (3, 3) from the axes of `offset` to the pixel axes of the photograph.
     `exposures`: relative exposures, NaN if unknown. `offset` (3,): approximate position of the flash relative to the
-    lens [mm]. `sphere`: a sphere in place of the object, which shades the sheet; None: no object. `curved`: True: also estimate the camera's response;
-    False: it is linear.
+    lens [mm]. `sphere`: a sphere in place of the object, which shades the sheet; None: no object. `curved`: True: also
+    estimate the camera's response; False: it is linear.
 
     The method is robust least squares of log brightness, with priors. It estimates the position and falloff of the
     flash and the camera's response, which all photographs share, and the intensity of each photograph. The sheet is
