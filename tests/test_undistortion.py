@@ -12,7 +12,7 @@ from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.geometry.hull import Hull, Silhouette
 from mi_ring.images import linear_to_srgb
 from mi_ring.importers.camera_models import Lens
-from mi_ring.importers.undistortion import undistort
+from mi_ring.importers.undistortion import Window, undistort
 
 W, H = 57, 41
 LENS = Lens("FULL_OPENCV", (W, H), (60.0, 66.0, 27.3, 19.6, 0.25, 0, 0, 0, 0, 0, 0, 0))  # a pincushion
@@ -32,6 +32,25 @@ def test_pixels_beyond_the_source_are_not_valid():
     pixels, valid = undistort(np.full((H, W, 3), 200, np.uint8), LENS, srgb=True)
     assert np.array_equal(valid, inside) and 0.8 < inside.mean() < 0.99
     assert (pixels[valid] == 200).all() and not pixels[~valid].any()
+
+
+def test_a_ramp_shows_where_each_pixel_comes_from():
+    """Bilinear interpolation of a linear image is exact, also where squares that are computed at once meet."""
+    for width, height in ((1100, 530), (7, 1), (1, 9)):
+        lens = Lens("FULL_OPENCV", (width, height), (900.0, 940.0, 0.47 * width, 0.52 * height, 0.25, *[0] * 7))
+        x, y = np.meshgrid((np.arange(width) + 0.5) / 900 - 0.47 * width / 900,
+                           (np.arange(height) + 0.5) / 940 - 0.52 * height / 940)  # fmt: skip
+        radial = 1 + 0.25 * (x * x + y * y)
+        x, y = 0.47 * width + 900 * x * radial, 0.52 * height + 940 * y * radial
+        ramp = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float32)
+        pixels, valid = undistort(ramp, lens, saturation=np.inf)
+        assert np.array_equal(valid, (x >= 0) & (x <= width) & (y >= 0) & (y <= height)) and valid.mean() > 0.8
+        expected = np.stack([(x - 0.5).clip(0, width - 1), (y - 0.5).clip(0, height - 1)], -1)
+        np.testing.assert_allclose(pixels[valid], expected[valid], atol=2e-4)
+        window = Window(width // 3, height // 2, width // 2 + 1, height // 3 + 1)
+        part, _ = undistort(ramp, lens, saturation=np.inf, window=window)
+        whole = pixels[window.top : window.top + window.height, window.left : window.left + window.width]
+        np.testing.assert_allclose(part, whole, atol=2e-4)
 
 
 def test_radiance_is_interpolated_not_its_encoding():

@@ -1,16 +1,17 @@
 """Removes lens distortion from images."""
 
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-import scipy.ndimage
 
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.images import linear_to_srgb
 from mi_ring.importers.camera_models import Lens
 
-AT_ONCE = 2**22  #: pixels; interpolating them takes about half a gigabyte
+TILE = 512  #: side of the squares that are interpolated at once [px], so that their arrays fit into the cache
+MOST_TILES = 100  #: whose interpolation is remembered: those of 24 megapixels, a third of a gigabyte
 
 
 class Window(NamedTuple):
@@ -40,10 +41,56 @@ def source_positions(lens: Lens, window: Window) -> np.ndarray:
     """
     (fx, fy), (cx, cy) = lens.focal, lens.centre
     left, top, width, height, scale = window
-    x = (left + (np.arange(width) + 0.5) * scale - cx) / fx
-    y = (top + (np.arange(height) + 0.5) * scale - cy) / fy
-    rays = np.stack([*np.broadcast_arrays(x, y[:, None]), np.ones((height, width))], -1).reshape(-1, 3)
-    return lens.colmap.img_from_cam(rays).reshape(height, width, 2)[..., ::-1].transpose(2, 0, 1) - 0.5
+    rays = np.ones((height, width, 3))
+    rays[..., 0] = (left + (np.arange(width) + 0.5) * scale - cx) / fx
+    rays[..., 1] = ((top + (np.arange(height) + 0.5) * scale - cy) / fy)[:, None]
+    pixels = lens.colmap.img_from_cam(rays.reshape(-1, 3))
+    return np.stack([pixels[:, 1], pixels[:, 0]]).reshape(2, height, width) - 0.5
+
+
+class Interpolation(NamedTuple):
+    """Where the source image shows the N pixels of a window, for bilinear interpolation in a crop of the source."""
+
+    crop: tuple[slice, slice]  #: rows and columns of the source that are needed
+    first: np.ndarray  #: (N,) int32: the upper left one of the four pixels, as an index into the crop, row by row
+    row: np.ndarray  #: (N, 1) float32 from 0 to 1: how far the place is below this pixel [px]
+    column: np.ndarray  #: (N, 1) float32 from 0 to 1: how far the place is to the right of this pixel [px]
+    valid: np.ndarray  #: (N,) bool: does the source show the place?
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Interpolate `values` (H, W, C), those of the crop. Returns (N, C) float32.
+
+        A place outside of the source gets the value of the nearest place inside.
+        """
+        flat = values.reshape(-1, values.shape[2]).astype(np.float32, copy=False)
+
+        def between_columns(first: np.ndarray) -> np.ndarray:
+            left, right = (flat.take(index, 0, mode="clip") for index in (first, first + 1))
+            right -= left
+            right *= self.column
+            right += left
+            return right
+
+        above, below = between_columns(self.first), between_columns(self.first + values.shape[1])
+        below -= above
+        below *= self.row
+        below += above
+        return below
+
+
+@lru_cache(maxsize=MOST_TILES)
+def interpolation(lens: Lens, window: Window) -> Interpolation:
+    """Return how the pixels of a window are interpolated in the distorted photograph."""
+    positions = source_positions(lens, window)
+    last = np.array(lens.size[::-1])[:, None, None] - 1
+    valid = np.all((positions >= -0.5) & (positions <= last + 0.5), 0)
+    positions = positions.clip(0, last)
+    first = np.minimum(positions.astype(np.int32), np.maximum(last - 1, 0), dtype=np.int32)
+    row, column = (positions - first).astype(np.float32).reshape(2, -1, 1)
+    low, high = first.min((1, 2)), np.minimum(first.max((1, 2)) + 2, last.ravel() + 1)
+    index = (first[0] - low[0]) * (high[1] - low[1]) + (first[1] - low[1])
+    crop = slice(low[0], high[0]), slice(low[1], high[1])
+    return Interpolation(crop, index.ravel(), row, column, valid.ravel())
 
 
 def undistort(
@@ -58,43 +105,36 @@ def undistort(
     None: the whole image.
     """
     window = window or Window(0, 0, *lens.size)
-    rows = max(1, AT_ONCE // window.width)
-    strips = [window._replace(top=top, height=min(rows, window.top + window.height - top))
-              for top in range(window.top, window.top + window.height, rows)]  # fmt: skip
-    parts = [undistort_part(pixels, lens, srgb, saturation, strip) for strip in strips]
-    images, valid = (np.concatenate(part) for part in zip(*parts))
-    return images, valid
+    image = np.empty((window.height, window.width, pixels.shape[2]), pixels.dtype)
+    valid = np.empty(image.shape[:2], bool)
+    for top, left in product(range(0, window.height, TILE), range(0, window.width, TILE)):
+        width, height = min(TILE, window.width - left), min(TILE, window.height - top)
+        at = interpolation(lens, Window(window.left + left, window.top + top, width, height))
+        place = slice(top, top + height), slice(left, left + width)
+        image[place] = interpolated(pixels, at, srgb, saturation).reshape(height, width, -1)
+        valid[place] = at.valid.reshape(height, width)
+    return image, valid
 
 
-def undistort_part(
-    pixels: np.ndarray, lens: Lens, srgb: bool, saturation: float, window: Window
-) -> tuple[np.ndarray, np.ndarray]:
-    """Remove the lens distortion in one window of an image. Returns (image (H, W, C), valid (H, W) bool).
-
-    The window must be small, because its arrays are of floats. `pixels`: the whole distorted image. `srgb`: the first
-    three channels are sRGB-encoded. `saturation`: encoded value (1 = full scale) from which a pixel is clipped;
-    infinite for masks.
-    """
-    positions = source_positions(lens, window)
-    size = np.array(pixels.shape[:2])
-    valid = np.all((positions >= -0.5) & (positions <= size[:, None, None] - 0.5), 0)
-    low = np.clip(np.floor(positions.min((1, 2))), 0, size - 1).astype(int)  # first and last source pixels needed
-    high = np.clip(np.ceil(positions.max((1, 2))) + 1, low + 1, size).astype(int)
-    pixels, positions = pixels[low[0] : high[0], low[1] : high[1]], positions - low[:, None, None]
-    full = 1.0 if pixels.dtype == np.float32 else np.iinfo(pixels.dtype).max
-
-    def resampled(channel: np.ndarray) -> np.ndarray:
-        return scipy.ndimage.map_coordinates(channel.astype(np.float32), positions, order=1, mode="nearest")
-
-    channels = []
-    for c in range(pixels.shape[2]):
-        encoded = pixels[..., c].astype(np.float32) / full
-        value = linear_to_srgb(resampled(srgb_to_linear(encoded))) if srgb and c < 3 else resampled(encoded)
-        clipped = encoded >= saturation
-        if c < 3 and clipped.any():  # alpha is never clipped
-            value = np.where(resampled(clipped) > 1e-6, np.maximum(value, encoded[clipped].min()), value)
-        channels.append(np.where(valid, value, 0))
-    result = np.stack(channels, -1)
-    if pixels.dtype != np.float32:
-        result = np.clip(result * full + 0.5, 0, full)
-    return result.astype(pixels.dtype), valid
+def interpolated(pixels: np.ndarray, at: Interpolation, srgb: bool, saturation: float) -> np.ndarray:
+    """Interpolate an image (H, W, C) at N places, with the options of `undistort`. Returns (N, C), 0 outside of it."""
+    source = pixels[at.crop]
+    full = 1 if pixels.dtype == np.float32 else np.iinfo(pixels.dtype).max
+    value = source if full == 1 else np.arange(full + 1, dtype=np.float32) / full  # of each pixel, or of each integer
+    linear = srgb_to_linear(value) if srgb else value
+    linear = linear if full == 1 else linear[source]
+    if srgb:  # but not alpha
+        linear[..., 3:] = source[..., 3:] / np.float32(full)
+    result = at(linear)
+    colours = result[:, :3]
+    if srgb:
+        colours[:] = linear_to_srgb(colours)
+    limit = saturation if full == 1 else int(np.searchsorted(value, np.float32(saturation)))
+    clipped = source[..., :3] >= limit  # alpha is never clipped
+    if clipped.any():
+        np.maximum(colours, limit / full, out=colours, where=at(clipped) > 1e-6)
+    if full > 1:
+        result *= full
+        result += 0.5
+    result[~at.valid] = 0
+    return result.astype(pixels.dtype)
