@@ -207,8 +207,8 @@ def moved(t):
     return mi.AffineTransform4f().translate(t * mi.Vector3f(0.6, -0.4, 0.3)) @ turn
 
 
-def derivative(scene, name, channels):
-    """(gradient, finite difference, standard error) of a weighted sum of pixels when `name` moves."""
+def derivative(scene, name, channels, count=6):
+    """(gradient, difference, standard error) of a weighted sum of pixels when `name` moves; `count` of differences."""
     params = mi.traverse(scene)
     value = params[name]
     start = type(value)(value)
@@ -226,15 +226,15 @@ def derivative(scene, name, channels):
         return mi.render(scene, params, spp=spp, seed=seed, seed_grad=seed + 1000)
 
     gradients, differences, step = [], [], 0.012
-    for seed in range(16):
+    for seed in range(8):
         t = mi.Float(0)
         dr.enable_grad(t)
         dr.backward(dr.sum(render(t, 36, seed) * mi.TensorXf(weights), axis=None))
         gradients.append(dr.grad(t)[0])
-    for seed in range(6):
+    for seed in range(count):
         high, low = (np.array(render(mi.Float(d), 256, seed), float) for d in (step, -step))
         differences.append(((high - low) * weights).sum() / (2 * step))
-    error = np.hypot(np.std(gradients, ddof=1) / 4, np.std(differences, ddof=1) / np.sqrt(6))
+    error = np.hypot(np.std(gradients, ddof=1) / np.sqrt(8), np.std(differences, ddof=1) / np.sqrt(count))
     return np.mean(gradients), np.mean(differences), error
 
 
@@ -255,15 +255,21 @@ def test_outline_moves_with_the_shape(name):
     check(a, b, error)
 
 
-@pytest.mark.parametrize("param", ["shape.to_world", "ground.to_world", "000.to_world"])
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize(
+    ("name", "param"),
+    [
+        *((name, "shape.to_world") for name in SHAPES),
+        *((name, "ground.to_world") for name in ("sphere", "rectangle")),
+        *((name, "000.to_world") for name in ("disk", "cylinder")),
+    ],
+)
 def test_shadow_moves_with_the_shape_the_ground_and_the_camera(name, param):
     ground = GROUND | {"to_world": mi.ScalarTransform4f().translate([0, 0, -0.9]).rotate([0.96, 0.28, 0], 12).scale(30)}
     white = {"type": "diffuse", "reflectance": 0.8}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "photometric"}, "sensor": SENSOR,
                           "shape": SHAPES[name] | {"bsdf": white}, "ground": ground | {"bsdf": white},
                           "flash": {"type": "flash"}}, optimize=False)  # fmt: skip
-    a, b, error = derivative(scene, param, slice(0, 3))
+    a, b, error = derivative(scene, param, slice(0, 3), 3 if param == "ground.to_world" else 6)
     check(a, b, error)
 
 
@@ -281,5 +287,5 @@ def test_shadows_of_the_scenes_own_lamps_move_with_them(kind):
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "photometric"}, "sensor": SENSOR | {"light": dim},
                           "shape": {"type": "sphere", "radius": 0.5, "bsdf": white}, "ground": ground | {"bsdf": white},
                           "lamp": lamps[kind]}, optimize=False)  # fmt: skip
-    a, b, error = derivative(scene, "lamp.position" if kind == "point" else "lamp.to_world", slice(0, 3))
+    a, b, error = derivative(scene, "lamp.position" if kind == "point" else "lamp.to_world", slice(0, 3), 3)
     check(a, b, error)

@@ -54,13 +54,13 @@ def test_flow_converges_to_the_solution_of_its_differential_equation_at_eulers_r
     def velocity(time, point):
         return 2 * plain(net, torch.from_numpy(point)).tanh().detach().numpy()
 
-    ends = [solve_ivp(velocity, (0, 1), point, method="DOP853", rtol=1e-10, atol=1e-10).y[:, -1] for point in x.numpy()]
+    ends = [solve_ivp(velocity, (0, 1), point, method="DOP853", rtol=1e-8, atol=1e-8).y[:, -1] for point in x.numpy()]
     exact, errors = torch.from_numpy(np.array(ends)), []
-    for net.steps in (40, 80, 160, 320):
+    for net.steps in (40, 80, 160):
         errors.append((net(x) - exact).norm().item())
     assert (exact - x).norm(dim=1).min() > 0.2
     ratios = [before / after for before, after in zip(errors, errors[1:])]
-    assert ratios == pytest.approx([2, 2, 2], abs=0.12)  # first order: half the step, half the error
+    assert ratios == pytest.approx([2, 2], abs=0.12)  # first order: half the step, half the error
 
 
 def test_shape_net_takes_its_euler_steps_through_its_velocity():

@@ -1,5 +1,6 @@
 """The package as others get it: wheel and sdist, and the program in an environment of its own."""
 
+import json
 import os
 import re
 import subprocess
@@ -92,25 +93,40 @@ def test_the_program_tells_its_version():
 
 def without_llvm(*arguments):
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": "/nowhere/libLLVM.so"}
-    done = subprocess.run([sys.executable, "-m", *arguments], capture_output=True, text=True, env=environment)
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment)
     return done.returncode, done.stdout, done.stderr.strip().splitlines()
 
 
 def test_without_llvm_the_doctor_says_what_to_do():
-    status, said, _ = without_llvm("mi_ring.doctor")
+    status, said, _ = without_llvm("-m", "mi_ring.doctor")
     assert status == 1 and "MISSING  LLVM" in said and said.endswith("A fit cannot run: LLVM missing\n")
-    assert without_llvm("mi_ring", "--help")[0] == 0
+    assert without_llvm("-m", "mi_ring", "--help")[0] == 0
     assert subprocess.run([sys.executable, "-m", "mi_ring.doctor"], capture_output=True).returncode == 0
 
 
-@pytest.mark.parametrize("command", ["fit", "check", "render", "export", "evaluate", "validate"])
-def test_without_llvm_a_command_ends_with_one_line(command, tmp_path):
-    more = {"render": ["a.xml", "b"], "export": ["a.ply"], "evaluate": ["--mesh", "a.ply"]}.get(command, [])
-    scene = tmp_path / "scene.xml"
+#: Runs commands one after the other, and tells the status with which each would end the process.
+IN_TURN = """
+import json, runpy, sys
+for name, *arguments in json.loads(sys.argv[1]):
+    sys.argv[1:] = arguments
+    try:
+        runpy.run_module(name, run_name="__main__", alter_sys=True)
+    except SystemExit as stop:
+        print(f"status {stop.code}", file=sys.stderr)
+"""
+
+
+def test_without_llvm_a_command_ends_with_one_line(tmp_path):
+    more = {"render": ["a.xml", "b"], "export": ["a.ply"], "evaluate": ["--mesh", "a.ply"]}
+    scene, names = tmp_path / "scene.xml", ["fit", "check", "render", "export", "evaluate", "validate"]
     scene.write_text("<scene version='3.0.0'/>")
-    status, _, complaint = without_llvm(f"mi_ring.{command}", str(scene), *more)
-    assert status == 2 and complaint[-1].startswith(f"mi_ring.{command}: mi_ring needs LLVM 17 or newer")
-    assert not any("Traceback" in line for line in complaint)
+    (tmp_path / "in_turn.py").write_text(IN_TURN)
+    calls = [[f"mi_ring.{name}", str(scene), *more.get(name, [])] for name in names]
+    *said, end = "\n".join(without_llvm(tmp_path / "in_turn.py", json.dumps(calls))[2]).split("status 2")
+    assert not end and len(said) == len(names)
+    for name, complaint in zip(names, said):
+        assert complaint.strip().splitlines()[-1].startswith(f"mi_ring.{name}: mi_ring needs LLVM 17 or newer")
+        assert "Traceback" not in complaint
 
 
 #: Makes Python believe that this is a slim container, where Dr.Jit and Mitsuba are installed and cannot be loaded.

@@ -121,9 +121,9 @@ def test_the_emitter_is_to_stock_integrators_what_the_harmonics_are_to_ours():
         halves = picture[..., : WIDTH // 2, :], picture[..., WIDTH // 2 :, :]
         return np.stack([half.mean((1, 2)) for half in halves])
 
-    a = np.stack([regions(ours(seed)) for seed in range(8)])
-    b = np.stack([regions(path(lit, 100 + 10 * n) - path(dark, 100 + 10 * n)) for n in range(8)])
-    error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / 8)
+    a = np.stack([regions(ours(seed)) for seed in range(5)])
+    b = np.stack([regions(path(lit, 100 + 10 * n) - path(dark, 100 + 10 * n)) for n in range(5)])
+    error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / 5)
     assert (np.abs(a.mean(0) - b.mean(0)) < 5 * error + 1e-4).all(), (a.mean(0) - b.mean(0)) / error
     assert (error < 0.05 * b.mean(0)).all()
 
@@ -167,7 +167,7 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     assert np.array(dr.grad(params[key])) @ step == pytest.approx(sides[0] - sides[1], rel=2e-2)  # other samples
 
 
-@pytest.mark.parametrize("frames", [("world",), ("camera",), ("world", "camera")])
+@pytest.mark.parametrize("frames", [("camera",), ("world", "camera")])
 def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     """In the axes that it is in; what is not in these stays as it was. What is missing is then as the room makes it.
 
@@ -186,7 +186,7 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     direct = torch.from_numpy(pictures(render_photographs(dark, photographs, 64, 0))).to(machine.device())
     room = RoomLight(torch.zeros(BASIS, 3), float(observed.mean()), frames).to(machine.device())
     surface = SimpleNamespace(scene=dark, table=None, unit=1.0)
-    for seed in range(12):
+    for seed in range(8):
         around = GlobalIllumination.of(surface, photographs, direct[..., 3], seed, 70, 64, harmonics=room.which)
         predicted = direct[..., :3] + around.interreflection
         lit_so_far = replace(photographs, room=room.harmonics.double().cpu().numpy())
