@@ -349,7 +349,9 @@ def test_memory_does_not_grow_with_photographs(tmp_path):
         cameras.append(shot._replace(focal=scale * shot.focal, centre=scale * shot.centre, size=size))
     shots, relative = [], []
     for k in range(24):
-        files = arrays.Files(Path(f"images/{k % 3}.jpg"), Path(f"masks/{k % 3}.png"))
+        if k >= 3:
+            (tmp_path / f"images/{k}.jpg").hardlink_to(tmp_path / f"images/{k % 3}.jpg")
+        files = arrays.Files(Path(f"images/{k}.jpg"), Path(f"masks/{k % 3}.png"))
         shots.append(Shot(f"{k:02}", cameras[k % 3], files=files, saturation=1 - 0.001 * k))  # none is read for another
         relative.append(files)
     (tmp_path / "scene.xml").write_bytes(arrays.scene_xml(shots, relative, None, None, None))
