@@ -18,7 +18,7 @@ from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import compact, ring_of, ring_state
-from mi_ring.system.machine import set_threads
+from mi_ring.system.machine import threads_of
 
 
 def points_near(n=500, seed=0):
@@ -260,21 +260,22 @@ SMALL = Config(iterations=24, levels=(2,), widths=(32,), shares=(1.0,), detail_s
 
 @pytest.fixture(scope="module")
 def detailed(small_capture):
-    set_threads(1)
-    fit = Fit(load_capture(small_capture), SMALL)
-    states = {}
-    for it in fit:
-        if it.number in (24, 31):
-            states[it.number] = fit.state()
+    with threads_of(1):
+        fit = Fit(load_capture(small_capture), SMALL)
+        states = {}
+        for it in fit:
+            if it.number in (24, 31):
+                states[it.number] = fit.state()
     return fit, states
 
 
 def test_a_fit_with_details_goes_on_where_it_stopped(detailed, small_capture):
     fit, states = detailed
     for number, state in states.items():
-        again = Fit(load_capture(small_capture), SMALL, state=state)
-        assert again.iteration == number
-        again.run()
+        with threads_of(1):
+            again = Fit(load_capture(small_capture), SMALL, state=state)
+            assert again.iteration == number
+            again.run()
         found, expected = again.ring.state_dict(), fit.ring.state_dict()
         assert found.keys() == expected.keys()
         assert all(torch.equal(found[name], expected[name]) for name in found)
@@ -282,8 +283,9 @@ def test_a_fit_with_details_goes_on_where_it_stopped(detailed, small_capture):
 
 def test_the_networks_stay_as_they_were(detailed, small_capture):
     fit, _ = detailed
-    alone = Fit(load_capture(small_capture), dataclasses.replace(SMALL, detail="none"))
-    alone.run()
+    with threads_of(1):
+        alone = Fit(load_capture(small_capture), dataclasses.replace(SMALL, detail="none"))
+        alone.run()
     for name, value in alone.ring.shape_net.state_dict().items():
         assert torch.equal(value, fit.ring.shape_net.base.network.state_dict()[name])
     assert any(values.any() for values in fit.ring.brdf_net.grid.values)
