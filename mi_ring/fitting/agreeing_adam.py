@@ -20,7 +20,7 @@ class AgreeingAdam(torch.optim.Optimizer):
     """
 
     def __init__(
-        self, params: Iterable[Tensor], lr: float, betas: tuple[float, float] = (0.9, 0.99), doubt: float = 2.5
+        self, params: Iterable[Tensor], lr: float, betas: tuple[float, float] = (0.9, 0.99), doubt: float = 1.5
     ) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "doubt": doubt})
 

@@ -119,7 +119,7 @@ class Tuning:
     detail_share: float = 0.13
     """Number of iterations that --detail adds at the end, as a share of --iterations. 0.13 of 1000: 130 more.
     Raise it if fine texture or relief is still blurred. With fewer than 10 such iterations there are no details."""
-    detail_rate: float = 0.05
+    detail_rate: float = 0.1
     """Learning rate of --detail. A value moves by this number at most in an iteration.
     A displacement of 1 is as large as the distance of its values. For colour see --learning-rate."""
     batch: int = 8

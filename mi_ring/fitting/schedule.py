@@ -76,7 +76,8 @@ class Schedule:
         finest = more // 3  # the rest is for coarser meshes
         for level in detail if config.detail != "none" and more >= FEWEST else ():
             last = first + (finest if level == detail[-1] else (more - finest) // max(1, len(detail) - 1))
-            stages.append(Stage(level, max(config.widths), first, last, detail=True))
+            mesh = max(level, config.levels[-1])  # on a coarser mesh details would learn the difference of the meshes
+            stages.append(Stage(mesh, max(config.widths), first, last, detail=True))
             first = last
         return cls(tuple(stage for stage in stages if stage.last > stage.first))
 
