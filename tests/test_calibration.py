@@ -27,6 +27,7 @@ from mi_ring.fitting import validation
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.refinement import refined_of
+from mi_ring.fitting.schedule import Stage
 from mi_ring.geometry.rotations import rotations
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.calibration_panel import held_out_text
@@ -429,7 +430,7 @@ def test_rates_of_cameras_and_lights_rise_once_there_is_a_shape_and_fall(small_c
     def rates(progress):
         unlit = SimpleNamespace(other_light=None)
         it = SimpleNamespace(terms={"calibration": 0.0}, loss=0.0, progress=progress, prediction=unlit,
-                             observation=None, batch=None)  # fmt: skip
+                             observation=None, batch=None, stage=Stage(2, 28, 0, 9))  # fmt: skip
         fit.optimisation.step(lambda: (sum(p.sum() for p in calibration.parameters()) * 0.0, it))
         groups = [g for o in fit.optimisation.optimizers for g in o.param_groups]
         return [next(g["lr"] for g in groups if any(p is unknown for p in g["params"]))

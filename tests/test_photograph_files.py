@@ -280,11 +280,11 @@ def test_masks_beside_the_photographs_are_found(tmp_path, kind, names, capsys):
     for k, stem in enumerate(["other", *stems[:2]]):
         file = tmp_path / "masks" / names.format(stem)
         file.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("L", SIZE, 10 * k).save(file)
+        Image.new("L", SIZE, (0, 150, 200)[k]).save(file)
     if ".jpg." in names:
         (tmp_path / "masks/b.jpg.PNG").rename(tmp_path / "masks/b.png.PNG")
     scene = converted(kind, source, tmp_path / "s.xml")
-    assert [None if mask is None else int(mask[0, 0]) for mask in scene.masks] == [10, 20, None]
+    assert [None if mask is None else int(mask[0, 0]) for mask in scene.masks] == [150, 200, None]
     printed = capsys.readouterr().out
     assert "1 photograph without a mask in" in printed and "1 mask in" in printed and "2 with masks" in printed
 
@@ -322,7 +322,7 @@ def test_one_mask_is_not_that_of_photographs_from_two_places(tmp_path, place):
     """Photographs of two folders have equal names, and one folder of masks has none of the folders."""
     shots = [{"file_path": f"images/{k}/1.png"} for k in "ab"]
     source = transforms(tmp_path, {"fl_x": 70.0, "fl_y": 76.0}, shots, lambda k: noise(np.uint8, seed=k))
-    write(tmp_path / place / "1.png", np.full((SIZE[1], SIZE[0], 1), 9, np.uint8))
+    write(tmp_path / place / "1.png", np.full((SIZE[1], SIZE[0], 1), 209, np.uint8))
     options = [] if place == "masks" else ["--masks", str(tmp_path / place)]
     with pytest.raises(InputError, match="1.png: would be the mask of two photographs, '.*a/1.png' and '.*b/1.png'; "):
         convert.main(["transforms", str(source), str(tmp_path / "s.xml"), *options])
@@ -330,11 +330,14 @@ def test_one_mask_is_not_that_of_photographs_from_two_places(tmp_path, place):
     content = json.loads(file.read_text())
     content["frames"][1]["transform_matrix"] = content["frames"][0]["transform_matrix"]
     file.write_text(json.dumps(content))
-    assert [int(mask[0, 0]) for mask in converted("transforms", source, tmp_path / "s.xml", *options).masks] == [9, 9]
+    assert [int(mask[0, 0]) for mask in converted("transforms", source, tmp_path / "s.xml", *options).masks] == [
+        209,
+        209,
+    ]
     for k in "ab":
-        write(tmp_path / place / k / "1.png", np.full((SIZE[1], SIZE[0], 1), ord(k), np.uint8))
+        write(tmp_path / place / k / "1.png", np.full((SIZE[1], SIZE[0], 1), 100 + ord(k), np.uint8))
     scene = converted("transforms", source, tmp_path / "t.xml", *options)
-    assert [int(mask[0, 0]) for mask in scene.masks] == [ord("a"), ord("b")]
+    assert [int(mask[0, 0]) for mask in scene.masks] == [197, 198]
 
 
 # What is left out

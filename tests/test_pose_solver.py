@@ -17,6 +17,7 @@ from mi_ring.fitting.exposure_solver import ExposureSolver
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.pose_solver import curvature, motion, slopes
 from mi_ring.fitting.processes import ALONE
+from mi_ring.fitting.schedule import Stage
 from mi_ring.geometry.camera import Camera
 
 SIZE = (7, 5)
@@ -109,7 +110,7 @@ def test_curvature_is_that_of_the_loss(small_capture, kind):
                               config=mi_ring.Config(loss="l2"), exposure=0.3, capture=SimpleNamespace(lit_room=False),
                               schedule=SimpleNamespace(outline_blur=lambda progress, width: 1.5))  # fmt: skip
     batch = SimpleNamespace(progress=0.5, photographs=index, all_photographs=index, size=(width, height), scale=1,
-                            share=ALONE.share(len(index)))  # fmt: skip
+                            stage=Stage(2, 28, 0, 9), share=ALONE.share(len(index)))  # fmt: skip
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
 
     def pictures(shift):
@@ -161,7 +162,7 @@ def test_cameras_begin_when_there_is_a_shape(small_capture, domain, start):
         with torch.no_grad():
             move += 1
         before = move.detach().clone()
-        fit.course.iteration = round(progress * fit.iterations)
+        fit.course.iteration = round(progress * fit.schedule.shaping)
         fit.step()
         assert (not torch.equal(move, before)) == moved
 
@@ -196,7 +197,7 @@ def test_powers_of_a_dark_colour_are_not_those_of_its_highlights(small_capture):
     observed[2, :, :, 1] = 1e-4  # nothing to be told of
     inside = torch.ones(3, 8, 10)
     batch = SimpleNamespace(progress=0.5, photographs=np.array([4, 7, 2]), all_photographs=np.array([4, 7, 2]),
-                            share=ALONE.share(3))  # fmt: skip
+                            share=ALONE.share(3), stage=Stage(2, 28, 0, 9))  # fmt: skip
     seen = Observation(observed, torch.zeros(3, 8, 10, 3, dtype=torch.bool), inside, torch.ones(3).bool(), None)
     it = Iteration(batch, seen, SimpleNamespace(rgb=predicted, coverage=inside), fit.context())
     powers.look(it)

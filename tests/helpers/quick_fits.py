@@ -32,7 +32,7 @@ def posed(capture, **changes):
     config = mi_ring.Config(**settings | changes)
     fit = mi_ring.Fit(mi_ring.load_capture(capture), config)
     fit.course.iteration, chosen = fit.iterations // 2, fit.sampler.draw_photographs(config.batch)
-    fit.sampler.draw_photographs = lambda count: chosen
+    fit.sampler.draw_photographs = lambda *_: chosen
     with torch.no_grad():
         it = iteration_of(fit)
     seen = it.observation._replace(rgb=it.prediction.rgb, mask=it.prediction.coverage)
