@@ -1,4 +1,4 @@
-"""The stage `detail`: grids take what is finer than the networks, which stay as they are."""
+"""The stage for details: grids represent what is finer than the networks, which stay as they are."""
 
 import math
 
@@ -14,13 +14,14 @@ from mi_ring.objects.ring_file import MAX_LEVEL
 
 SPACING, CELL = 1.2, 1.25  #: of the finest mesh's vertices, and side of the finest cubes [px]
 OCTAVES = 4  #: of the grids: the coarsest cubes are as large as what the networks represent
-CHUNK = 2**16  #: points that the networks evaluate at once
 STEEPEST, HALVINGS = 0.2, 8  #: least cosine between a triangle with and without details; see `unfold`
-LEVELS = 2  #: number of meshes, from coarse to fine
 
 
 def pixels_per_unit(problem: Problem, center: np.ndarray, radius: float) -> float:
-    """Resolution [px] of the photographs for a length of 1 in the normalised frame: the median of all photographs."""
+    """Compute how many pixels of a photograph show a length of 1 in the normalised frame. Returns the median.
+
+    `center` (3,), `radius`: normalising sphere [scene units]. The photographs are as wide as in the last stage.
+    """
     width = max(problem.config.widths)
     found = []
     for k in problem.fitted:
@@ -31,9 +32,9 @@ def pixels_per_unit(problem: Problem, center: np.ndarray, radius: float) -> floa
 
 
 def detail_levels(ring: FittedObject, resolution: float) -> list[int]:
-    """Choose the levels of the meshes for details, from coarse to fine.
+    """Choose the levels of the two meshes for details, the coarse one and the fine one.
 
-    `resolution`: pixels of the photographs for a length of 1 in the normalised frame. The list is empty if a network is
+    `resolution`: pixels of a photograph for a length of 1 in the normalised frame. The list is empty if a network is
     not registered: no file could hold its details.
     """
     if not all(is_registered(net) for net in (ring.shape_net, ring.brdf_net)):
@@ -41,16 +42,18 @@ def detail_levels(ring: FittedObject, resolution: float) -> list[int]:
     area = trimesh.Trimesh(ring.domain.points, ring.domain.faces, process=False).area
     finest = math.log(area * (resolution / SPACING) ** 2 / 10, 4)
     finest = min(MAX_LEVEL, max(0, math.ceil(finest - 0.5)))
-    return [max(0, finest - k) for k in reversed(range(LEVELS))]
+    return [max(0, finest - 1), finest]
 
 
 @torch.no_grad()
 def add_detail(ring: FittedObject, level: int, resolution: float) -> None:
-    """Add grids of value 0 to both networks. `level`: of the finest mesh. `resolution`: see `pixels_per_unit`."""
+    """Add grids of value 0 to both networks, in place.
+
+    `level`: level of the finest mesh. `resolution`: pixels of a photograph for a length of 1 in the normalised frame.
+    """
     s, faces = ring.domain.sample(level)
     s = s.to(ring.center.device)
-    points = torch.cat([ring.shape_net(part) for part in s.split(CHUNK)])
-    surface = trimesh.Trimesh(points.numpy(force=True), faces, process=False)
+    surface = trimesh.Trimesh(ring.shape_net(s).numpy(force=True), faces, process=False)
     domain = trimesh.Trimesh(s.numpy(force=True), faces, process=False)
     cell = CELL * math.sqrt(domain.area / surface.area) / resolution  # the flow stretches the domain
     around = torch.cat([s, s[torch.from_numpy(faces)].mean(1)]).cpu()
@@ -71,9 +74,9 @@ def share_weights(ring: FittedObject) -> None:
 
 @torch.no_grad()
 def unfold(ring: FittedObject, level: int) -> None:
-    """Reduce displacements, in place, where they turn triangles of the mesh at this `level` away from their directions.
+    """Reduce displacements, in place, where they turn triangles of the mesh at `level` by about 80 degrees or more.
 
-    The displacements around such a triangle are halved until none is left, and set to 0 if that takes too long.
+    The displacements around such a triangle are halved, eight times at most. The last time they become 0.
     """
     s, faces = ring.domain.sample(level)
     s = s.to(ring.center.device)
@@ -85,7 +88,7 @@ def unfold(ring: FittedObject, level: int) -> None:
         a, b, c = points[corners].unbind(1)
         return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
 
-    smooth = normals(flow.base(flow.base.network, s, 1.0))
+    smooth = normals(flow.base(s, 1.0))
     for k in range(HALVINGS):
         folded = (normals(flow(s)) * smooth).sum(1) < STEEPEST
         if not folded.any():

@@ -142,8 +142,7 @@ class Optimisation:
             wrong = ", ".join(name for name, value in it.terms.items() if not math.isfinite(value))
             raise InputError(f"{path}: diverged at iteration {it.number - 1}{' by the term ' * bool(wrong)}{wrong}; "
                              f"try a lower {option}")  # fmt: skip
-        if not it.stage.detail:
-            self.model.update_albedo()
+        self.model.update_albedo()
         return it
 
     def prepare(self, schedule: Schedule, iteration: int) -> None:
@@ -155,13 +154,13 @@ class Optimisation:
         """
         if iteration in [stage.last for stage in schedule.stages if stage.detail]:
             unfold(self.model.ring, schedule.stage(iteration - 1).level)
-        stage = schedule.stage(min(iteration, schedule.iterations - 1))
-        if self.model.detailed or (stage.detail and iteration < schedule.iterations):
-            if not self.model.detailed:
-                self.model.add_detail(schedule.final_level)
-                self.begin()
+        stage = schedule.stage(iteration) if iteration < schedule.iterations else None
+        if stage and stage.detail and not self.model.detailed:
+            self.model.add_detail(schedule.final_level)
+            self.begin()
+        if self.model.detailed:
             return
-        fixed = stage.settles and iteration < schedule.iterations
+        fixed = bool(stage and stage.settles)
         self.model.fix_surface(fixed)
         if fixed and iteration == schedule.shaping and self.model.calibration:
             self.model.calibration.room.forget()

@@ -56,7 +56,7 @@ class Schedule:
         """Plan the stages of a fit with these settings. Stages without iterations are left out.
 
         `near`: the fit starts near the object's surface; its first stage is shorter. `settling`: add a stage in which
-        the surface is fixed. `detail`: add stages in which details are found, on meshes of these levels.
+        the surface is fixed. `detail`: levels of the coarse and the fine mesh for details, the last stages; empty: none.
         """
         shares = list(config.shares)
         if near and len(shares) > 1:
@@ -73,12 +73,11 @@ class Schedule:
             stages.append(Stage(config.levels[-1], config.widths[-1], first, first + more, settles=True))
             first += more
         more = round(config.detail_share * config.iterations)
-        finest = more // 3  # the rest is for coarser meshes
-        for level in detail if config.detail != "none" and more >= FEWEST else ():
-            last = first + (finest if level == detail[-1] else (more - finest) // max(1, len(detail) - 1))
+        shown = config.detail != "none" and more >= FEWEST
+        for level, count in zip(detail, (more - more // 3, more // 3)) if shown else ():
             mesh = max(level, config.levels[-1])  # on a coarser mesh details would learn the difference of the meshes
-            stages.append(Stage(mesh, max(config.widths), first, last, detail=True))
-            first = last
+            stages.append(Stage(mesh, max(config.widths), first, first + count, detail=True))
+            first += count
         return cls(tuple(stage for stage in stages if stage.last > stage.first))
 
     @property
@@ -112,7 +111,7 @@ class Schedule:
         return min(1.0, iteration / self.shaping)
 
     def detail_progress(self, iteration: int) -> float:
-        """Share, in [0, 1], of the iterations for details that are done before this one."""
+        """Return the share of the iterations for details that are done before `iteration`, in [0, 1]."""
         first = next((stage.first for stage in self.stages if stage.detail), self.iterations)
         return max(0, iteration - first) / max(1, self.iterations - first)
 

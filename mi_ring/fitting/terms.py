@@ -64,7 +64,7 @@ def mask(it: Iteration) -> Tensor | None:
 def velocity(it: Iteration) -> Tensor | None:
     """Compute the term `velocity`, the paper's L_reg, at random points on the paths of domain points through the flow.
 
-    Returns None in the last stage, when the surface is fixed.
+    Returns None once the networks no longer shape the surface.
     """
     if it.stage.settles or it.stage.detail:
         return None
@@ -88,8 +88,8 @@ def calibration(it: Iteration) -> Tensor | None:
 def settling(it: Iteration) -> Tensor | None:
     """Compute the term `settling`: the variation of the material along the surface.
 
-    It reduces slow variation, which is probably an effect of the light. Returns None until the last stage, when the
-    surface is fixed.
+    It reduces slow variation, which is probably an effect of the light. Returns None except in the
+    stage in which the surface is fixed.
     """
     return priors.albedo_variation(it) if it.stage.settles else None
 

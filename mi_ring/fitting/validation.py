@@ -48,7 +48,9 @@ def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) 
 def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Any]:
     """Reset each option of `--refine` that does not improve the prediction of held-out photographs. Changes `model`.
 
-    To reset an option is to give its unknowns the values of the capture. Options of single photographs are not reset.
+    Details that do not improve it are removed first; `put_back` then contains "detail". To reset an option is to give
+    its unknowns the values of the capture. Options of single photographs are not reset.
+
     Returns a dict. `put_back`: list of the reset options. `unexplained`: mean relative error of the predictions after
     that. `before`: the same error with the capture's values for all unknowns. The last two are missing if no held-out
     photograph shows the object; `before` is also missing if nothing is refined.

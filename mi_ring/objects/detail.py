@@ -51,11 +51,11 @@ class Grid(nn.Module):
         return grid
 
     def keys(self, octave: int) -> Tensor:
-        """The sorted keys (N,) of an octave's corners."""
+        """Return the sorted keys (N,) of the corners of an octave, counted from the coarsest."""
         return getattr(self, f"keys{octave}")
 
     def arguments(self) -> dict[str, Any]:
-        """The arguments of the constructor."""
+        """Return the arguments of the constructor as plain data."""
         return {"cell": self.cells[-1], "nodes": [len(v) for v in self.values], "channels": self.values[0].shape[1]}
 
     def weights(self, s: Tensor) -> list[scipy.sparse.csr_matrix]:
@@ -64,7 +64,7 @@ class Grid(nn.Module):
         The eight corners around a point have weights above 0. A corner without a value has none.
         """
         for points, weights in self.latest:
-            if points.data_ptr() == s.data_ptr() and points.shape == s.shape:
+            if same(points, s):
                 return weights
         self.latest.clear()
         found = []
@@ -79,7 +79,7 @@ class Grid(nn.Module):
         self.latest = other.latest
 
     def octave_weights(self, s: Tensor, octave: int) -> scipy.sparse.csr_matrix:
-        """Return the weights (V, N) of one octave at points (V, 3), see `weights`."""
+        """Compute the weights (V, N) of the N corners of one octave at points (V, 3)."""
         keys, at = self.keys(octave).cpu(), s.double() / self.cells[octave]
         cube = torch.floor(at)
         key = key_of(cube.long()[:, None] + CORNERS)
@@ -111,29 +111,36 @@ class _Product(torch.autograd.Function):
         return torch.from_numpy(ctx.matrix.T @ gradient.numpy(force=True)).to(gradient.device), None
 
 
+def same(a: Tensor, b: Tensor) -> bool:
+    """Return True if two tensors are the same memory, so that results for one are valid for the other."""
+    return a.data_ptr() == b.data_ptr() and a.shape == b.shape
+
+
 def key_of(corners: Tensor) -> Tensor:
-    """One integer for three, (..., 3), in lexicographic order."""
+    """Pack integer coordinates (..., 3) of corners into one integer each, (...), in lexicographic order."""
     x, y, z = (corners.clamp(-MOST, MOST - 1) + MOST).unbind(-1)
     return (x << 2 * BITS) + (y << BITS) + z
 
 
 class Remembered(nn.Module):
-    """A network without gradients that remembers its last result: a fit of details asks for the same points again.
+    """A frozen network that keeps its last result, because a fit of details asks for the same points again.
 
-    It always computes in float32: the rounding of bfloat16 would be as large as details.
+    It always computes in float32: the rounding of bfloat16 would be as large as details. `method`: the method of the
+    network that is called.
     """
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, method: str = "forward") -> None:
         super().__init__()
         self.network: Any = network.requires_grad_(False)
-        self.last: tuple[Tensor, Any, Tensor] | None = None  #: points, further argument, result
+        self.method = method
+        self.last: tuple[Tensor, tuple[float, ...], Tensor] | None = None  #: points, further arguments, result
 
-    def __call__(self, function: Any, s: Tensor, *more: float) -> Tensor:
-        """Return `function(s, *more)`."""
+    def forward(self, s: Tensor, *more: float) -> Tensor:
+        """Call the method with points (V, 3) and further arguments."""
         last = self.last
-        if last is None or last[0].data_ptr() != s.data_ptr() or last[0].shape != s.shape or last[1] != more:
+        if last is None or not same(last[0], s) or last[1] != more:
             with torch.no_grad(), torch.autocast(s.device.type, enabled=False):
-                self.last = last = s.detach(), more, function(s, *more)
+                self.last = last = s.detach(), more, getattr(self.network, self.method)(s, *more)
         return last[2]
 
 
@@ -144,7 +151,7 @@ class DetailedFlow(Flow):
     Each corner of the grid has a direction. Its values are displacements in sides of the octave's cubes.
     """
 
-    base: "Remembered"
+    base: Remembered
     grid: Grid
 
     def __init__(self, flow: dict, grid: dict) -> None:
@@ -157,7 +164,10 @@ class DetailedFlow(Flow):
 
     @classmethod
     def of(cls, flow: Flow, grid: Grid, points: Tensor, normals: Tensor) -> "DetailedFlow":
-        """Add a displacement to `flow`, along the `normals` (V, 3) of its surface at domain `points` (V, 3)."""
+        """Add a displacement to `flow`, which is frozen.
+
+        The displacement is along the `normals` (V, 3) of the surface at domain `points` (V, 3).
+        """
         detailed = cls(architecture_of(flow), grid.arguments())
         detailed.base, detailed.grid = Remembered(flow), grid
         for k, weights in enumerate(grid.weights(points)):
@@ -166,7 +176,7 @@ class DetailedFlow(Flow):
         return detailed
 
     def arguments(self) -> dict:
-        """The arguments of the constructor."""
+        """Return the arguments of the constructor as plain data."""
         return {"flow": architecture_of(self.base.network), "grid": self.grid.arguments()}
 
     def velocity_of(self, step: int) -> Any:
@@ -182,33 +192,33 @@ class DetailedFlow(Flow):
         """Φ(x, time) for points (V, 3), displaced by the share `time` of the full displacement."""
         vectors = [cell * own * getattr(self, f"directions{k}")
                    for k, (cell, own) in enumerate(zip(self.grid.cells, self.grid.values))]  # fmt: skip
-        return self.base(self.base.network, x, time) + time * self.grid(x, vectors)
+        return self.base(x, time) + time * self.grid(x, vectors)
 
 
 @register_network("detailed-material")
 class DetailedMaterial(MaterialNet):
     """A BRDF-Net, and what a grid adds to its outputs before these are mapped to the ranges of the parameters."""
 
-    base: "Remembered"
+    base: Remembered
     grid: Grid
 
     def __init__(self, net: dict, grid: dict) -> None:
         """Make a network whose grid adds 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`."""
         made = build(net)
         super().__init__(made.bsdf_parameters)
-        self.base, self.grid = Remembered(made), Grid(**grid)
+        self.base, self.grid = Remembered(made, "evaluate"), Grid(**grid)
 
     @classmethod
     def of(cls, net: MaterialNet, grid: Grid) -> "DetailedMaterial":
-        """Add a grid to `net`."""
+        """Add a grid to `net`, which is frozen."""
         detailed = cls(architecture_of(net), grid.arguments())
-        detailed.base, detailed.grid = Remembered(net), grid
+        detailed.base, detailed.grid = Remembered(net, "evaluate"), grid
         detailed.set_parameters(net.bsdf_parameters, float(net.scale))
         return detailed
 
     def arguments(self) -> dict:
-        """The arguments of the constructor."""
+        """Return the arguments of the constructor as plain data."""
         return {"net": architecture_of(self.base.network), "grid": self.grid.arguments()}
 
     def evaluate(self, s: Tensor) -> Tensor:
-        return self.base(self.base.network.evaluate, s).float() + self.grid(s)
+        return self.base(s).float() + self.grid(s)
