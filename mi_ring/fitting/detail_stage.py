@@ -59,9 +59,9 @@ def add_detail(ring: FittedObject, level: int, resolution: float) -> None:
     around = torch.cat([s, s[torch.from_numpy(faces)].mean(1)]).cpu()
     normals = torch.from_numpy(surface.vertex_normals.astype(np.float32))
     device = ring.center.device
-    shape, material = (Grid.around(around, cell, OCTAVES, channels) for channels in (1, ring.brdf_net.outputs))
-    ring.shape_net = DetailedFlow.of(ring.shape_net, shape, s, normals).to(device)
-    ring.brdf_net = DetailedMaterial.of(ring.brdf_net, material).to(device)
+    grid = Grid.around(around, cell, OCTAVES, channels=1)
+    ring.brdf_net = DetailedMaterial.of(ring.brdf_net, grid.like(ring.brdf_net.outputs)).to(device)
+    ring.shape_net = DetailedFlow.of(ring.shape_net, grid, s, normals).to(device)
     share_weights(ring)
     ring.subdivisions = level
 

@@ -56,7 +56,7 @@ class Schedule:
         """Plan the stages of a fit with these settings. Stages without iterations are left out.
 
         `near`: the fit starts near the object's surface; its first stage is shorter. `settling`: add a stage in which
-        the surface is fixed. `detail`: levels of the coarse and the fine mesh for details, the last stages; empty: none.
+        the surface is fixed. `detail`: levels of the coarse and the fine mesh for details, which come last.
         """
         shares = list(config.shares)
         if near and len(shares) > 1:

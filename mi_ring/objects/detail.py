@@ -47,7 +47,14 @@ class Grid(nn.Module):
             keys.append(torch.unique(key_of(cubes[:, None] + CORNERS)))
         grid = cls(cell, [len(own) for own in keys], channels)
         for k, own in enumerate(keys):
-            getattr(grid, f"keys{k}").copy_(own)
+            grid.keys(k).copy_(own)
+        return grid
+
+    def like(self, channels: int) -> "Grid":
+        """Make a grid with the same corners and another number of channels. Its values are 0."""
+        grid = Grid(**self.arguments() | {"channels": channels})
+        for k in range(len(self.values)):
+            grid.keys(k).copy_(self.keys(k))
         return grid
 
     def keys(self, octave: int) -> Tensor:
