@@ -16,6 +16,7 @@ import trimesh
 from helpers.microfacets import directions, twin
 from PIL import Image
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
 from mi_ring import export
 from mi_ring.errors import InputError
@@ -334,11 +335,15 @@ def test_khronos_validator_finds_nothing(glb_file):
 
 
 def test_glb_read_by_another_library(ring, glb_file):
-    """Its colours, at its texture coordinates, are those of the network at the attributes that are beside them."""
+    """Its colours, at its texture coordinates, are those of the network at the vertices."""
     scene = trimesh.load(glb_file)
     mesh = next(iter(scene.geometry.values()))
-    names = ("diffuse", "specular", "roughness")
-    exact = {name: np.asarray(mesh.vertex_attributes[f"_{name.upper()}"]).squeeze() for name in names}
+    with torch.no_grad():
+        s = ring.domain.sample(3)[0]
+        surface = ring.surface(s).numpy()
+        distance, nearest = cKDTree(surface).query(mesh.vertices)
+        exact = {name: values.numpy() for name, values in ring.material(s[nearest]).items()}
+    assert distance.max() < 1e-5
     uv = mesh.visual.uv * [1, -1] + [0, 1]  # trimesh turns v over
     found = bilinear(np.asarray(mesh.visual.material.baseColorTexture.convert("RGB")), uv) / 255
     expected = math.pi * exact["diffuse"] / (1 - 4 * exact["specular"][:, None])
@@ -347,8 +352,6 @@ def test_glb_read_by_another_library(ring, glb_file):
     rough = bilinear(np.asarray(mesh.visual.material.metallicRoughnessTexture.convert("RGB")), uv) / 255
     assert np.abs(rough[:, 1] - np.sqrt(exact["roughness"])).max() < 0.03 and (rough[:, 2] == 0).all()
     np.testing.assert_allclose(scene.extents, 0.001 * mesh.extents, rtol=1e-5)
-    with torch.no_grad():
-        surface = ring.surface(ring.domain.sample(3)[0]).numpy()
     np.testing.assert_allclose(mesh.bounds, [surface.min(0), surface.max(0)], rtol=1e-6)
 
 
@@ -358,9 +361,9 @@ def test_glb_says_what_it_holds(glb_file):
     assert node["scale"] == [0.001] * 3 and node["extras"]["unit"] == "0.001 m"
     assert material["extras"]["mi_ring"]["bsdf"] == '<bsdf type="cooktorrance"/>'
     assert material["extensions"]["KHR_materials_specular"]["specularColorFactor"] == [25] * 3
-    attributes = content["meshes"][0]["primitives"][0]["attributes"]
-    assert set(material["extras"]["mi_ring"]["attributes"].values()) <= set(attributes)
-    assert {"POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"} <= set(attributes)
+    attributes = set(content["meshes"][0]["primitives"][0]["attributes"])
+    assert attributes >= {"POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"}
+    assert len(attributes) <= 5, "Blender 5.0 mixes up several attributes of our own"
 
 
 def test_obj_is_closed_and_wears_its_texture(ring, run, tmp_path):

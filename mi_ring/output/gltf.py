@@ -115,31 +115,30 @@ def glb(
     None: no rotation. `views`: cameras and masks of photographs; the vertex attribute _SEEN is 1 where one of them
     shows the vertex, otherwise 0; None: no such attribute.
 
-    The parameters of the BSDF are vertex attributes, too (_DIFFUSE, …); the extras of the material describe them.
     Raises InputError if glTF cannot express the material.
     """
     require_expressible(ring)
     atlas = unwrap(ring, subdivisions, resolution, time)
     texels = rasterise(ring, atlas, resolution, time)
     material = metallic_roughness(ring.bsdf, reflectances(ring, texels.s))
-    exact, seen = reflectances(ring, atlas.s), None
+    seen = None
     if views is not None:
         s = np.zeros((atlas.uncut.max() + 1, 3), np.float32)
         s[atlas.uncut] = atlas.s
         seen = visible_points(ring, s, atlas.uncut[atlas.faces], views)[0][atlas.uncut]
-    return assemble_glb(atlas, textures(material, texels), material, exact, ring.bsdf, metres, seen, up)
+    return assemble_glb(atlas, textures(material, texels), material, ring.bsdf, metres, seen, up)
 
 
 def assemble_glb(
-    atlas: Atlas, images: dict[str, np.ndarray], material: Material, exact: dict[str, np.ndarray], bsdf: str,
-    metres: float | None = None, seen: np.ndarray | None = None, up: Sequence[float] | None = None,
+    atlas: Atlas, images: dict[str, np.ndarray], material: Material, bsdf: str, metres: float | None = None,
+    seen: np.ndarray | None = None, up: Sequence[float] | None = None,
 ) -> bytes:  # fmt: skip
     """Make a GLB file from a mesh with V vertices and its textures. Returns the bytes of the file.
 
     `images`: uint8 arrays (H, W, 3 or 4) by glTF's names of textures. `material`: its constant factors are used.
-    `exact`: BSDF parameters (V, 3) or (V,) by name, written as vertex attributes. `bsdf`: Mitsuba's XML of the BSDF.
-    `metres`: length of a scene unit [m], None: unknown. `seen` (V,) bool: True where a photograph shows the vertex;
-    None: no such attribute. `up` (3,): up direction, which a node turns to the y axis; None: no rotation.
+    `bsdf`: Mitsuba's XML of the BSDF, which the extras of the material keep. `metres`: length of a scene unit [m],
+    None: unknown. `seen` (V,) bool: True where a photograph shows the vertex; None: no such attribute. `up` (3,): up
+    direction, which a node turns to the y axis; None: no rotation.
     """
     blob = bytearray()
     buffer_views: list[pygltflib.BufferView] = []
@@ -167,7 +166,7 @@ def assemble_glb(
         return kind(index=len(sources) - 1)
 
     vertices = {"POSITION": atlas.vertices, "NORMAL": atlas.normals, "TANGENT": atlas.tangents, "TEXCOORD_0": atlas.uv}
-    vertices |= {f"_{name.upper()}": values for name, values in exact.items()}
+    # No second attribute of our own: Blender 5.0 mixes them up if their types differ.
     vertices |= {} if seen is None else {"_SEEN": seen}
     attributes = pygltflib.Attributes()
     for name, values in vertices.items():
@@ -185,9 +184,7 @@ def assemble_glb(
         extensions={"KHR_materials_specular": {
             "specularTexture": {"index": specular.index}, "specularColorFactor": [material.specular_color] * 3,
         }},
-        extras={"mi_ring": {
-            "bsdf": bsdf, "attributes": {name: f"_{name.upper()}" for name in exact}, "scale": material.scale,
-        }},
+        extras={"mi_ring": {"bsdf": bsdf, "scale": material.scale}},
     )  # fmt: skip
     node = pygltflib.Node(
         name="object", mesh=0, scale=[metres] * 3 if metres else None,
