@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+AT_ONCE = 2**20  #: values: the intermediate results of all would take much memory
+
 
 class AgreeingAdam(torch.optim.Optimizer):
     """Adam that does not follow noise. It is for values of which each iteration shows only some, and those with noise.
@@ -35,13 +37,15 @@ class AgreeingAdam(torch.optim.Optimizer):
                 state = self.state[p]
                 if not state:
                     state |= {name: torch.zeros_like(p) for name in ("times", "mean", "square")}
-                times, mean, square, seen = state["times"], state["mean"], state["square"], p.grad != 0
-                times += seen
-                mean.lerp_(torch.where(seen, p.grad, mean), 1 - first)
-                square.lerp_(torch.where(seen, p.grad.square(), square), 1 - second)
-                left = torch.exp(times * math.log(first))  # weight of the zeros that the mean began with
-                agreement = mean / (1 - left) / (square / (1 - torch.exp(times * math.log(second)))).sqrt()
-                agreement = agreement.clamp(-1, 1)  # the averages have different memories
-                deviation = ((1 - first) / (1 + first) * (1 + left) / (1 - left)).sqrt()
-                step = agreement.sign() * (agreement.abs() - group["doubt"] * deviation).clamp(min=0)
-                p.sub_(torch.where(seen, step, 0), alpha=group["lr"])
+                several = p, p.grad, state["times"], state["mean"], state["square"]
+                for values, gradient, times, mean, square in zip(*(t.view(-1).split(AT_ONCE) for t in several)):
+                    seen = gradient != 0
+                    times += seen
+                    mean.lerp_(torch.where(seen, gradient, mean), 1 - first)
+                    square.lerp_(torch.where(seen, gradient.square(), square), 1 - second)
+                    left = torch.exp(times * math.log(first))  # weight of the zeros that the mean began with
+                    agreement = mean / (1 - left) / (square / (1 - torch.exp(times * math.log(second)))).sqrt()
+                    agreement = agreement.clamp(-1, 1)  # the averages have different memories
+                    deviation = ((1 - first) / (1 + first) * (1 + left) / (1 - left)).sqrt()
+                    step = agreement.sign() * (agreement.abs() - group["doubt"] * deviation).clamp(min=0)
+                    values.sub_(torch.where(seen, step, 0), alpha=group["lr"])

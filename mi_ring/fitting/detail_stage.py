@@ -7,6 +7,7 @@ import torch
 import trimesh
 
 from mi_ring.fitting.problem import Problem
+from mi_ring.geometry.meshes import area_vectors
 from mi_ring.nets.registry import is_registered
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
 from mi_ring.objects.fitted_object import FittedObject
@@ -52,16 +53,14 @@ def add_detail(ring: FittedObject, level: int, resolution: float) -> None:
     `level`: level of the finest mesh. `resolution`: pixels of a photograph for a length of 1 in the normalised frame.
     """
     s, faces = ring.domain.sample(level)
-    s = s.to(ring.center.device)
-    surface = trimesh.Trimesh(ring.shape_net(s).numpy(force=True), faces, process=False)
-    domain = trimesh.Trimesh(s.numpy(force=True), faces, process=False)
-    cell = CELL * math.sqrt(domain.area / surface.area) / resolution  # the flow stretches the domain
-    around = torch.cat([s, s[torch.from_numpy(faces)].mean(1)]).cpu()
-    normals = torch.from_numpy(surface.vertex_normals.astype(np.float32))
-    device = ring.center.device
-    grid = Grid.around(around, cell, OCTAVES, channels=1)
-    ring.brdf_net = DetailedMaterial.of(ring.brdf_net, grid.like(ring.brdf_net.outputs)).to(device)
-    ring.shape_net = DetailedFlow.of(ring.shape_net, grid, s, normals).to(device)
+    s, corners = s.to(ring.center.device), torch.from_numpy(faces).to(ring.center.device)
+    domain, surface = area_vectors(s, corners), area_vectors(ring.shape_net(s), corners)
+    stretch = math.sqrt(surface.norm(dim=1).sum() / domain.norm(dim=1).sum())  # of the domain by the flow
+    around = torch.cat([s, s[corners].mean(1)]).cpu()
+    grid = Grid.around(around, CELL / stretch / resolution, OCTAVES, channels=1)
+    normals = torch.zeros_like(s).index_add(0, corners.ravel(), surface.repeat_interleave(3, 0))
+    ring.brdf_net = DetailedMaterial.of(ring.brdf_net, grid.like(ring.brdf_net.outputs)).to(s.device)
+    ring.shape_net = DetailedFlow.of(ring.shape_net, grid, s, normals).to(s.device)
     share_weights(ring)
     ring.subdivisions = level
 
@@ -85,8 +84,7 @@ def unfold(ring: FittedObject, level: int) -> None:
         return
 
     def normals(points: torch.Tensor) -> torch.Tensor:
-        a, b, c = points[corners].unbind(1)
-        return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+        return torch.nn.functional.normalize(area_vectors(points, corners), dim=1)
 
     smooth = normals(flow.base(s, 1.0))
     for k in range(HALVINGS):

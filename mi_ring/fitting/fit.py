@@ -114,7 +114,7 @@ class Fit(Renamed):
         self.course.iteration += 1
         self.optimisation.prepare(self.schedule, self.iteration)
         self.course.seconds += time.perf_counter() - started
-        if it.number == it.stage.last:
+        if it.number in (it.stage.first + 1, it.stage.last):
             release_memory()  # what comes next has other sizes
         if (last := it.number == self.iterations) and len(self.problem.held_out):
             masked = replace(self.problem, capture=self.capture)

@@ -5,7 +5,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+import torch
 import trimesh
+from torch import Tensor
 
 from mi_ring.errors import InputError, require_file
 from mi_ring.foreign import reading
@@ -48,3 +50,12 @@ def load_closed_mesh(path: Path, field: str) -> trimesh.Trimesh:
 def genus(mesh: trimesh.Trimesh) -> int:
     """Return the number of handles of a closed surface: 0 for a sphere, 1 for a torus. Several pieces are summed."""
     return mesh.body_count - mesh.euler_number // 2
+
+
+def area_vectors(points: Tensor, faces: Tensor) -> Tensor:
+    """Compute normals of triangles, each as long as twice the triangle's area: (F, 3).
+
+    `points` (V, 3), `faces` (F, 3): a mesh. Normals point to where the corners are seen counterclockwise.
+    """
+    a, b, c = (points[corner] for corner in faces.T)
+    return torch.linalg.cross(b - a, c - a)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from mi_ring.geometry.meshes import area_vectors
 from mi_ring.objects.detail import DetailedFlow
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.optional import need
@@ -25,15 +26,11 @@ def inside_out(ring: FittedObject, s: torch.Tensor, faces: np.ndarray) -> np.nda
     s = s.to(ring.center.device)
     corners = torch.as_tensor(faces, device=s.device)
 
-    def crosses(points: torch.Tensor) -> torch.Tensor:
-        a, b, c = points[corners].unbind(1)
-        return torch.linalg.cross(b - a, c - a)
-
     with torch.no_grad():
-        centres, normals = s[corners].mean(1), F.normalize(crosses(s), dim=1)
+        centres, normals = s[corners].mean(1), F.normalize(area_vectors(s, corners), dim=1)
         outward = flow(centres + STEP * normals) - flow(centres - STEP * normals)
-        smooth = crosses(flow(s))
-        return (((smooth * outward).sum(1) <= 0) | ((smooth * crosses(ring.shape_net(s))).sum(1) <= 0)).cpu().numpy()
+        smooth, found = area_vectors(flow(s), corners), area_vectors(ring.shape_net(s), corners)
+        return (((smooth * outward).sum(1) <= 0) | ((smooth * found).sum(1) <= 0)).cpu().numpy()
 
 
 def exactly_crossing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

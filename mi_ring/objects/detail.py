@@ -17,10 +17,12 @@ from torch.autograd.function import once_differentiable
 from mi_ring.nets.brdf_net import MaterialNet
 from mi_ring.nets.registry import architecture_of, build, register_network
 from mi_ring.nets.shape_net import Flow
+from mi_ring.system.machine import release_memory
 
 CORNERS = torch.tensor(list(itertools.product((0, 1), repeat=3)))  #: (8, 3) of a cube
 AT_ONCE = 2**16  #: points whose weights are computed at once
-BITS, MOST = 21, 2**20  #: a key holds three coordinates of 21 bits, counted from -`MOST`
+MOST = 2**20  #: coordinates of cubes are from -`MOST` to `MOST` - 1
+PLACES = torch.tensor([2**42, 2**21, 1])  #: a key is the scalar product of these and of a corner's coordinates
 
 
 class Grid(nn.Module):
@@ -43,8 +45,8 @@ class Grid(nn.Module):
         """Make a grid whose cubes contain the points (V, 3)."""
         keys = []
         for k in reversed(range(octaves)):
-            cubes = torch.unique(torch.floor(points.double() / (cell * 2**k)).long(), dim=0)
-            keys.append(torch.unique(key_of(cubes[:, None] + CORNERS)))
+            cubes = torch.unique(keys_of(torch.floor(points.double() / (cell * 2**k))))
+            keys.append(torch.unique(cubes[:, None] + CORNERS @ PLACES))
         grid = cls(cell, [len(own) for own in keys], channels)
         for k, own in enumerate(keys):
             grid.keys(k).copy_(own)
@@ -74,29 +76,29 @@ class Grid(nn.Module):
             if same(points, s):
                 return weights
         self.latest.clear()
-        found = []
+        rows, found = np.arange(0, 8 * len(s) + 1, 8, dtype=np.int32), []
         for k in range(len(self.values)):
             parts = [self.octave_weights(part, k) for part in s.detach().cpu().split(AT_ONCE)]
-            found.append(scipy.sparse.vstack(parts, "csr"))
+            weight, node = (torch.cat(part).numpy().ravel() for part in zip(*parts))
+            found.append(scipy.sparse.csr_matrix((weight, node, rows), (len(s), len(self.keys(k)))))
         self.latest.append((s.detach(), found))
+        release_memory()  # intermediate results take more than the weights
         return found
 
     def share(self, other: "Grid") -> None:
         """Use the same memory for weights as `other`, a grid with the same corners."""
         self.latest = other.latest
 
-    def octave_weights(self, s: Tensor, octave: int) -> scipy.sparse.csr_matrix:
-        """Compute the weights (V, N) of the N corners of one octave at points (V, 3)."""
+    def octave_weights(self, s: Tensor, octave: int) -> tuple[Tensor, Tensor]:
+        """Compute the weights (V, 8) of the corners around points (V, 3), and their places (V, 8) among the values."""
         keys, at = self.keys(octave).cpu(), s.double() / self.cells[octave]
         cube = torch.floor(at)
-        key = key_of(cube.long()[:, None] + CORNERS)
+        key = keys_of(cube)[:, None] + CORNERS @ PLACES
         place = torch.searchsorted(keys, key).clamp(max=len(keys) - 1)
         share = (at - cube)[:, None]
         weight = torch.where(CORNERS == 1, share, 1 - share).prod(-1) * (keys[place] == key)
         weight /= weight.sum(1, keepdim=True).clamp(min=0.5)  # small parts of the domain are in cubes without values
-        rows = np.arange(0, 8 * len(s) + 1, 8, dtype=np.int32)
-        parts = weight.float().numpy().ravel(), place.int().numpy().ravel(), rows
-        return scipy.sparse.csr_matrix(parts, (len(s), len(keys)))
+        return weight.float(), place.int()
 
     def forward(self, s: Tensor, values: Sequence[Tensor] | None = None) -> Tensor:
         """Interpolate at points (V, 3): (V, channels). `values` (N, channels) of each octave replace the grid's own."""
@@ -123,10 +125,9 @@ def same(a: Tensor, b: Tensor) -> bool:
     return a.data_ptr() == b.data_ptr() and a.shape == b.shape
 
 
-def key_of(corners: Tensor) -> Tensor:
-    """Pack integer coordinates (..., 3) of corners into one integer each, (...), in lexicographic order."""
-    x, y, z = (corners.clamp(-MOST, MOST - 1) + MOST).unbind(-1)
-    return (x << 2 * BITS) + (y << BITS) + z
+def keys_of(cubes: Tensor) -> Tensor:
+    """Pack the coordinates (..., 3) of cubes, whole numbers, into one integer each, (...), in lexicographic order."""
+    return (cubes.clamp(-MOST, MOST - 1) + MOST).long() @ PLACES
 
 
 class Remembered(nn.Module):

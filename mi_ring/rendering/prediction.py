@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mi_ring.geometry.meshes import area_vectors
 from mi_ring.nets.brdf_net import COOK_TORRANCE, Parameter
 from mi_ring.rendering.bridge import differentiable, evaluated, to_drjit
 from mi_ring.rendering.edge_selection import Edges
@@ -69,7 +70,7 @@ def finite_gradient(gradient: Tensor, vertices: Tensor, faces: np.ndarray) -> Te
         return gradient
     corners = torch.from_numpy(np.asarray(faces, np.int64)).to(vertices.device)
     a, b, c = vertices[corners.T]
-    areas = torch.linalg.cross(b - a, c - a).norm(dim=-1)
+    areas = area_vectors(vertices, corners).norm(dim=-1)
     longest = torch.maximum((b - a).norm(dim=-1), (c - a).norm(dim=-1))
     flat = ~(areas > NO_AREA * longest**2) | ((b - c).norm(dim=-1) == 0)
     degenerate = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from mi_ring.geometry.camera import Camera
+from mi_ring.geometry.meshes import area_vectors
 from mi_ring.scene.assembly import RenderedObject
 from mi_ring.scene.plain_mesh import mesh_of
 
@@ -92,8 +93,7 @@ def visible_points(
     the start surface. `faces` (F, 3): triangles. `views`: cameras of the photographs.
     """
     with torch.no_grad():
-        vertices = ring.surface(torch.as_tensor(s, device=ring.center.device)).cpu().numpy()
-    seen = Visibility(vertices, faces, views).of_vertices()
-    a, b, c = vertices[faces].transpose(1, 0, 2).astype(float)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        vertices = ring.surface(torch.as_tensor(s, device=ring.center.device)).cpu()
+    seen = Visibility(vertices.numpy(), faces, views).of_vertices()
+    areas = area_vectors(vertices.double(), torch.as_tensor(faces)).norm(dim=1).numpy()
     return seen, float((areas * (~seen)[faces].mean(1)).sum() / areas.sum())
