@@ -13,6 +13,7 @@ import torch
 import trimesh
 
 from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.system.optional import need
 from mi_ring.system.progress import progress
@@ -149,7 +150,7 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
 
     flat = mesh_of(np.pad(uv, ((0, 0), (0, 1))), faces, normals=False)
     y, x = np.mgrid[:resolution, :resolution].reshape(2, -1)
-    centre = mi.Point3f(*((np.stack([x, y]) + 0.5) / resolution).astype(np.float32), 1)
+    centre = mi.Point3f(*(to_flat(mi.Float, (k + 0.5) / resolution) for k in (x, y)), 1)
     rays = mi.Ray3f(centre, mi.Vector3f(0, 0, -1))
     hit = mi.load_dict({"type": "scene", "atlas": flat}).ray_intersect_preliminary(rays)
     inside = np.array(hit.is_valid())

@@ -14,6 +14,7 @@ from mi_ring.output import gltf
 from mi_ring.output.atlas import Atlas, Texels
 from mi_ring.output.ply import write_ply
 from mi_ring.rendering.spherical_harmonics import room_envmap, room_of
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.scene.shot import Shot
 from mi_ring.system.files import write_file
@@ -49,7 +50,7 @@ def write_scene(
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
     params = mi.traverse(mesh)
-    params["vertex_normals"] = mi.Float(atlas.normals.astype(np.float32).ravel())  # Mitsuba's own have seams
+    params["vertex_normals"] = to_flat(mi.Float, atlas.normals)  # Mitsuba's own have seams
     params.update()
     files.append(path.with_name(f"{path.stem}_object.ply"))
     write_ply(mesh, files[-1])

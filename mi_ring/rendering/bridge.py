@@ -9,13 +9,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from mi_ring.scene.alignment import ALIGNMENT
+
 
 def to_drjit(tensor: Tensor) -> mi.Float:
     """Convert a tensor to a flat Dr.Jit Float that shares the tensor's memory (DLPack). Drops gradients.
 
-    Nobody may write to this memory later.
+    Nobody may write to this memory later. A tensor that does not begin at a multiple of `ALIGNMENT` is copied.
     """
-    return mi.Float(tensor.detach().contiguous().ravel())
+    flat = tensor.detach().contiguous().ravel()
+    return mi.Float(flat if flat.data_ptr() % ALIGNMENT == 0 else flat.clone())
 
 
 def to_torch(array: mi.Float) -> Tensor:

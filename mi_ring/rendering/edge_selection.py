@@ -6,6 +6,7 @@ import numpy as np
 
 from mi_ring.errors import SceneError
 from mi_ring.rendering.edge_curves import CURVES, OUTLINE_OFFSET, EdgeSamples, outline_of
+from mi_ring.scene.alignment import to_flat
 
 SMOOTH, CREASE, BORDER = 0, 1, 2  # kinds of edges: normals of both sides agree, they differ, there is only one side
 SAMPLES, MIN_SAMPLES = 4, 2048  #: per edge of a mesh, and at least for all edges of the scene together
@@ -40,9 +41,9 @@ class Edges:
             tables.append(edge_table(mesh, faces) + np.array([[vertices, vertices, triangles, triangles, 0]]).T)
             vertices += mesh.vertex_count()
             triangles += len(faces)
-        self.corners = mi.UInt32(np.concatenate(corners).astype(np.uint32).ravel())
-        table = np.concatenate(tables, 1).astype(np.uint32)
-        self.v0, self.v1, self.f0, self.f1, self.kind = (mi.UInt32(row) for row in table)
+        self.corners = to_flat(mi.UInt32, np.concatenate(corners))
+        table = np.concatenate(tables, 1)
+        self.v0, self.v1, self.f0, self.f1, self.kind = (to_flat(mi.UInt32, row) for row in table)
 
     @classmethod
     def of(cls, scene, known: "Edges | None" = None) -> "Edges":

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.errors import SceneError
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.lights import Light, position_of, strength_of
 from mi_ring.scene.shot import Shot
 
@@ -44,7 +45,7 @@ class Lights:
         if lit.any() and not lit.all():
             name = shots[int(lit.argmin())].name
             raise SceneError(f'photograph "{name}": its light is 0 strong, must be positive, or 0 in all photographs')
-        return cls(mi.Float(places.ravel()), mi.Bool(finite), mi.Float(strengths.ravel()))
+        return cls(to_flat(mi.Float, places), mi.Bool(finite), to_flat(mi.Float, strengths))
 
     @classmethod
     def attached(cls, emitter) -> "Lights":

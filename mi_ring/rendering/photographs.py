@@ -12,6 +12,7 @@ from mi_ring.rendering.photograph_lights import Lights, flash_falloff
 from mi_ring.rendering.pinhole import Pinhole
 from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes, reflected_harmonics
 from mi_ring.rendering.views import Views
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.shot import Shot
 
 LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
@@ -71,9 +72,7 @@ class Photographs:
         """
         width, height = size
         views = self.views._replace(intrinsics=self.views.intrinsics / dr.opaque(mi.Float, scale))
-        return replace(
-            self, views=views, index=mi.UInt32(np.asarray(index, np.uint32)), size=(width // scale, height // scale)
-        )
+        return replace(self, views=views, index=to_flat(mi.UInt32, index), size=(width // scale, height // scale))
 
     def with_views(self, views: Views) -> "Photographs":
         """Return a copy with other cameras and lights. `views`: Dr.Jit buffers for all photographs.
@@ -169,7 +168,7 @@ class Photographs:
             return None
 
         def radiance(si):
-            buffer = mi.Float(self.room[which].astype(np.float32).ravel())
+            buffer = to_flat(mi.Float, self.room[which])
             values = reflected_harmonics(bsdfs_with_lobes(scene), si, self.camera(view).to_world, which)
             return sum((value * dr.gather(mi.Color3f, buffer, n) for n, value in enumerate(values)), mi.Color3f(0))
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mi_ring.rendering.bridge import to_drjit
 from mi_ring.rendering.edge_selection import Edges
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.assembly import RenderedObject, lamp_lights, move_lamps, split_tables, with_fitted_shape, with_lamps
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.scene.plain_mesh import FACES, POSITIONS
@@ -85,7 +86,7 @@ class Surface:
         If the number of vertices changes, an attribute that is not in `arrays` becomes 0. The BSDF must not read it.
         """
         if self.faces_changed:
-            self.params[self.prefix + FACES] = mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel())
+            self.params[self.prefix + FACES] = to_flat(mi.UInt32, self.faces)
             self.faces_changed = False
         for name, array in arrays.items():
             self.params[self.prefix + name] = array

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_ring.geometry.camera import Camera
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.shot import Shot
 
 
@@ -40,7 +41,7 @@ class Views(NamedTuple):
 
     def buffers(self) -> "Views":
         """Convert NumPy arrays to flat Dr.Jit buffers of float32. `falloff` and `distortion` become None if all 0."""
-        buffers = {name: mi.Float(array.astype(np.float32).ravel()) for name, array in self._asdict().items()}
+        buffers = {name: to_flat(mi.Float, array) for name, array in self._asdict().items()}
         return Views(**buffers | {name: None for name in ("falloff", "distortion") if not getattr(self, name).any()})
 
     def camera(self, k: int, size: tuple[int, int]) -> Camera:

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.lights import LAMP_CLASSES, Light, emitter_of, light_of, move_lamp
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.xml_elements import load_bsdf
@@ -127,7 +128,7 @@ def with_fitted_shape(
     params = mi.traverse(new)
     points = np.array(params["vertex_positions"]).reshape(-1, 3)
     ball = ring.center.numpy(force=True) + MAX_EXTENT * float(ring.radius) * points
-    params["vertex_positions"] = mi.Float((ball / unit).astype(np.float32).ravel())
+    params["vertex_positions"] = to_flat(mi.Float, ball / unit)
     params.update()
     return changed_scene(scene, shapes=[new if other == shape else other for other in scene.shapes()]), new
 

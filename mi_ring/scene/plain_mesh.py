@@ -1,7 +1,8 @@
 """Makes Mitsuba meshes from arrays."""
 
 import mitsuba as mi
-import numpy as np
+
+from mi_ring.scene.alignment import to_flat
 
 # Mitsuba's names of mesh parameters. Mitsuba 3.10 renames them.
 POSITIONS, FACES = "vertex_positions", "faces"
@@ -14,10 +15,10 @@ def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
     """
     mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals, has_vertex_texcoords=uv is not None)
     params = mi.traverse(mesh)
-    params[POSITIONS] = mi.Float(np.asarray(vertices, np.float32).ravel())
-    params[FACES] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
+    params[POSITIONS] = to_flat(mi.Float, vertices)
+    params[FACES] = to_flat(mi.UInt32, faces)
     if uv is not None:
-        params["vertex_texcoords"] = mi.Float(np.asarray(uv, np.float32).ravel())
+        params["vertex_texcoords"] = to_flat(mi.Float, uv)
     params.update()
     return mesh
 

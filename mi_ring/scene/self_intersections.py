@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.plain_mesh import scene_of
 
 HIT_OFFSET = 1e-6  #: step of a ray past a hit, for a mesh of size 1: more than float32's rounding error
@@ -29,8 +30,9 @@ def crossing_triangles(vertices, faces) -> np.ndarray:
     lanes = np.flatnonzero(length > 0)
     while len(lanes):
         start = origin[lanes] + along[lanes] * reached[lanes, None]
-        ray = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), mi.Vector3f(*along[lanes].T.astype(np.float32)))
-        ray.maxt = mi.Float((length - reached)[lanes].astype(np.float32))
+        begin, toward = ([to_flat(mi.Float, part) for part in a.T] for a in (start, along[lanes]))
+        ray = mi.Ray3f(mi.Point3f(*begin), mi.Vector3f(*toward))
+        ray.maxt = to_flat(mi.Float, (length - reached)[lanes])
         hit = scene.ray_intersect_preliminary(ray)
         valid, t, triangle = (np.array(a) for a in (hit.is_valid(), hit.t, hit.prim_index))
         lanes, t, triangle = lanes[valid], t[valid], triangle[valid]
