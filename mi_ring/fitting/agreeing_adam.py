@@ -22,8 +22,9 @@ class AgreeingAdam(torch.optim.Optimizer):
     """
 
     def __init__(
-        self, params: Iterable[Tensor], lr: float, betas: tuple[float, float] = (0.9, 0.99), doubt: float = 1.5
-    ) -> None:
+        self, params: Iterable[Tensor] | Iterable[dict[str, Any]], lr: float,
+        betas: tuple[float, float] = (0.9, 0.99), doubt: float = 1.5,
+    ) -> None:  # fmt: skip
         super().__init__(params, {"lr": lr, "betas": betas, "doubt": doubt})
 
     @torch.no_grad()

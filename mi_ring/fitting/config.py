@@ -120,8 +120,8 @@ class Tuning:
     """Number of iterations that --detail adds at the end, as a share of --iterations. 0.13 of 1000: 130 more.
     Raise it if fine texture or relief is still blurred. With fewer than 10 such iterations there are no details."""
     detail_rate: float = 0.1
-    """Learning rate of --detail: the longest step of a value in an iteration. For a displacement, 1 is the width of a
-    cell of its grid. Lower it if the surface becomes rough."""
+    """Learning rate of --detail: the longest displacement in an iteration, in widths of a cell of its grid. Values of
+    textures change by up to three times as much. Lower it if the surface becomes rough."""
     batch: int = 8
     """Photographs in each iteration. More photographs make an iteration slower and its gradient less noisy."""
     steps: int = 3
