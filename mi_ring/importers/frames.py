@@ -41,6 +41,7 @@ class Frame:
     fill_mask: bool = False  #: fill the holes in the mask
     said: str = ""  #: the path of the photograph in the other tool's file; empty if that names no photographs
     orientation: int = 1  #: EXIF orientation by which the file's pixels are to be turned
+    mask_orientation: int = 1  #: the same of the mask's file
 
     @property
     def camera(self) -> Camera:
@@ -176,6 +177,28 @@ def adapt_all(source: Source, frames: Sequence[Frame]) -> None:
         source.notes.append(f"{left} photographs not turned by their EXIF orientation: cameras are taken to be of the "
                             "pixels as stored")  # fmt: skip
     source.notes.extend(f"{count} {what}" for what, count in Counter(filter(None, done)).items())
+
+
+def turn_masks(source: Source, frames: Sequence[Frame]) -> None:
+    """Set the orientations of the masks of photographs that are turned. May add a note to `source`.
+
+    The size of a mask shows whether it is upright or as the photograph is stored. For 180 degrees and for square
+    photographs it does not: then the masks of the others decide, if they agree, otherwise the mask's own EXIF data.
+    """
+    turned = [(f, f.mask) for f in frames if f.orientation > 1 and f.mask and f.mask != f.image]
+    shown = {mask: image_size(mask) != frame.lens.size for frame, mask in turned
+             if frame.orientation > 4 and frame.lens.size[0] != frame.lens.size[1]}  # fmt: skip
+    kinds, unknown = {*shown.values()}, 0
+    for frame, mask in turned:
+        if mask in shown or len(kinds) == 1:
+            as_stored = shown[mask] if mask in shown else kinds == {True}
+            frame.mask_orientation = frame.orientation if as_stored else 1
+        else:
+            frame.mask_orientation = orientation_of(mask)
+            unknown += frame.mask_orientation == 1
+    if unknown:
+        source.notes.append(f"{unknown} masks of photographs that EXIF turns are taken to be upright: their sizes do "
+                            "not tell")  # fmt: skip
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
