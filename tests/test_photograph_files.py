@@ -1,6 +1,7 @@
 """Which file is the photograph of which camera, and what is said of those that are left over."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -399,4 +400,21 @@ def test_cameras_of_colmap_without_lines_of_points_are_refused(tmp_path):
     lines = [line for line in path.read_text().splitlines() if line.startswith("#") or line.endswith(".jpg")]
     path.write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"images.txt: line \d+: must be the points of the camera in the line before"):
+        converted("colmap", folder, tmp_path / "s.xml", "--images", folder.parent / "images")
+
+
+@pytest.mark.parametrize(("file", "change", "words"), [
+    ("images.txt", str.rstrip, r"images.txt: line \d+: must be the points of the camera in the line before"),
+    ("images.txt", "\ufeff{}".format, "images.txt: begins with a byte order mark"),
+    ("cameras.txt", "\ufeff{}".format, "cameras.txt: begins with a byte order mark"),
+    ("cameras.txt", lambda text: text.replace("27.25", "27,25"), "cameras.txt: has 27,25; must have decimal points"),
+    ("images.txt", lambda text: re.sub(r"(?m)^(\d+) 0\.", r"\1 0,", text), r"images.txt: line \d+: has 0,\d+; must be"),
+    ("images.txt", lambda text: re.sub(r"(?m)^(\d+) \S+ \S+ \S+ \S+", r"\1 0 0 0 0", text), "of sub/1.jpg is 0 0 0 0"),
+])  # fmt: skip
+def test_what_colmap_would_misread_is_refused(tmp_path, file, change, words):
+    folder = colmap_folder(tmp_path) / "text"
+    for name in ("rigs.txt", "frames.txt"):  # as of versions before rigs
+        (folder / name).unlink()
+    (folder / file).write_text(change((folder / file).read_text()))
+    with pytest.raises(InputError, match=words):
         converted("colmap", folder, tmp_path / "s.xml", "--images", folder.parent / "images")

@@ -191,7 +191,7 @@ def turn_masks(source: Source, frames: Sequence[Frame]) -> None:
     kinds, unknown = {*shown.values()}, 0
     for frame, mask in turned:
         if mask in shown or len(kinds) == 1:
-            as_stored = shown[mask] if mask in shown else kinds == {True}
+            as_stored = shown.get(mask, kinds == {True})
             frame.mask_orientation = frame.orientation if as_stored else 1
         else:
             frame.mask_orientation = orientation_of(mask)
@@ -229,7 +229,8 @@ def require_cameras(frames: Sequence[Frame]) -> None:
     """Raise InputError if a frame has an invalid pose, lens, light or file name."""
     for frame in frames:
         what = f"{frame.image}: camera"
-        command.require_utf8(str(frame.image))
+        for file in (frame.image, frame.mask or frame.image):
+            command.require_utf8(str(file))
         rotation = frame.pose[:3, :3]
         if not np.allclose(frame.pose[3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{what}: the last row of its pose is {frame.pose[3]}, must be 0 0 0 1; is it transposed?")

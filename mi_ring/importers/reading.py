@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -208,8 +209,15 @@ def load_mat(path: Path) -> dict:
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file and return its value. Raises InputError if that fails."""
-    return read_as(path, "JSON", lambda file: json.loads(file.read_bytes()))
+    """Read a JSON file and return its value. Raises InputError if that fails, or if an object has a key twice."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(found := dict(pairs)) < len(pairs):
+            key, _ = Counter(key for key, _ in pairs).most_common(1)[0]
+            raise ValueError(f"an object has the key {key[:60]!r} twice")
+        return found
+
+    return read_as(path, "JSON", lambda file: json.loads(file.read_bytes(), object_pairs_hook=unique))
 
 
 def require_object(value: Any, what: str) -> dict:

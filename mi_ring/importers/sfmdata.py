@@ -47,8 +47,8 @@ class SfmData(Photogrammetry):
             "data/width data/height data/focal_length data/principal_point": "OpenMVG: intrinsics",
             "value0/width value0/height value0/focal_length value0/principal_point": "OpenMVG: intrinsics",
             "data/disto_k1 data/disto_k3 data/disto_t2 data/fisheye": "OpenMVG: distortion",
-            "views poses intrinsics rigs rigs/subPoses extrinsics */key */value value/ptr_wrapper ptr_wrapper/data data/value0":
-                "hold the others",
+            "views poses intrinsics rigs rigs/subPoses extrinsics": "hold the others",
+            "*/key */value value/ptr_wrapper ptr_wrapper/data data/value0": "hold the others",
         },
         refused={
             "intrinsics/undistortionType": "a second model of the lens",

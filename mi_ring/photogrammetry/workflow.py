@@ -97,10 +97,10 @@ def find_sheet(
                     raise InputError("{}: is {} x {} pixels; the shorter side must be at least {}, and an {}th of the "
                                      "longer one".format(picture.path, *picture.size, SMALLEST, FLATTEST))  # fmt: skip
                 detection = MarkerSheet(1.0).detect(picture.srgb())
-                paper = ()
-                if detection:
-                    paper = sample_paper(picture.pixels[..., :3], detection, picture.to_linear, picture.saturation)
-                return [a.tolist() for a in (*detection, *paper)] if detection else None
+                if detection is None:
+                    return None
+                paper = sample_paper(picture.pixels[..., :3], detection, picture.to_linear, picture.saturation)
+                return [a.tolist() for a in (*detection, *paper)]
             except InputError as error:
                 if isinstance(error.__cause__, ImportError):  # a package is missing: the file is fine
                     raise
