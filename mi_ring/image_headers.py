@@ -107,7 +107,6 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     suffix = path.suffix.lower()
     if suffix == ".exr":
-        exr_picture(exr_channels(dict(exr_attributes(path))[b"channels"]))
         return exr_size(path)[:2]
     if suffix in TIFF:  # Pillow would rotate it by its orientation; `read_image` does not
         with tifffile.TiffFile(path) as file:
@@ -171,7 +170,7 @@ def has_alpha_channel(path: Path) -> bool:
     if suffix in (".jpg", ".jpeg", *RAW):
         return False
     if suffix == ".exr":
-        names = exr_channels(dict(exr_attributes(path))[b"channels"])
+        names = [*exr_channels(dict(exr_attributes(path))[b"channels"])]
         return any(name.rpartition(".")[2] == "A" for name in names)
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:
@@ -297,17 +296,17 @@ def exr_attributes(path: Path) -> Iterator[tuple[bytes, bytes]]:
             file.seek(max(0, size - 2**16), os.SEEK_CUR)
 
 
-def exr_channels(value: bytes) -> list[str]:
-    """Read the channel names from `value`, the bytes of the OpenEXR attribute `channels`.
+def exr_channels(value: bytes) -> dict[str, int]:
+    """Read the channels from `value`, the bytes of the OpenEXR attribute `channels`: pixel types by name.
 
-    A zero byte and 16 more bytes follow each name.
+    A type is 0 (integers), 1 (half floats) or 2 (floats). A zero byte and 16 more bytes follow each name.
     """
-    names, place = [], 0
+    kinds, place = {}, 0
     while value[place]:
         end = value.index(b"\0", place)
-        names.append(value[place:end].decode("utf-8", "replace"))
+        kinds[value[place:end].decode("utf-8", "replace")] = value[end + 1]
         place = end + 17
-    return names
+    return kinds
 
 
 def exr_picture(names: Sequence[str]) -> list[str]:
@@ -332,13 +331,15 @@ def exr_picture(names: Sequence[str]) -> list[str]:
 def exr_size(path: Path) -> tuple[int, int, int]:
     """Read (width [px], height [px], number of channels) from the header of an OpenEXR file.
 
-    Raises ValueError if the file contains no pixels, or only a part of the picture.
+    Raises ValueError if no channels form a picture of floats, or if there are no pixels, or only a part of them.
     """
     found = dict(exr_attributes(path))
     left, top, right, bottom = data = struct.unpack("<4i", found[b"dataWindow"])
-    channels = len(exr_channels(found[b"channels"]))
-    if min(right - left, bottom - top, channels - 1) < 0:
+    kinds = exr_channels(found[b"channels"])
+    if min(right - left, bottom - top, len(kinds) - 1) < 0:
         raise ValueError("declares no pixels")
+    if integers := [name for name in exr_picture([*kinds]) if not kinds[name]]:
+        raise ValueError(f"has integers in the channels {', '.join(integers)}; save them as floats")
     if data != (whole := struct.unpack("<4i", found.get(b"displayWindow", found[b"dataWindow"]))):
         raise ValueError(f"its data window {data} is not its display window {whole}; save the whole picture")
-    return right - left + 1, bottom - top + 1, channels
+    return right - left + 1, bottom - top + 1, len(kinds)

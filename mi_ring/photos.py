@@ -193,6 +193,9 @@ def make(config: PhotosConfig, scene: Path) -> None:
         require_half(sum(p.mask_file(config.masks) is not None for p in pictures), pictures, config.masks)
     elif config.masks == "alpha" and not any(p.path.suffix.lower() in folder.TRANSPARENT for p in pictures):
         require_half(0, pictures, "alpha")
+    pictures, note = folder.with_saturations(pictures)
+    if note:
+        print(note)
     print(f"Assumed: {'; '.join(encodings([picture.path for picture in pictures]))}")
     for left in config.out.glob(".scene.*/"):  # left by a process that was killed
         shutil.rmtree(left, ignore_errors=True)

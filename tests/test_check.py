@@ -5,7 +5,7 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers.silhouettes import ball, silhouettes
+from helpers.silhouettes import W, ball, silhouettes
 from PIL import Image
 
 from mi_ring import check
@@ -169,6 +169,24 @@ def test_masks_that_agree_but_cover_the_border_are_named(broken_capture, tmp_pat
     edit_images(path, wrong, "masks")
     status, text = run(path, tmp_path, capsys)
     assert status == 1 and "inverted" in text and "255 is to be the object, 0 the background" in text, text
+
+
+@pytest.mark.parametrize(("square", "quarters"), [(True, 1), (True, 2), (True, 3), (False, 2)])
+def test_a_turned_mask_is_recognised(square, quarters):
+    views = list(silhouettes(ball(4.0), 12))
+    if square:
+        rows = [(0, views[0].mask.shape[1] - views[0].mask.shape[0]), (0, 0)]
+        views = [mask_agreement.with_camera(s, size=(W, W))._replace(mask=np.pad(s.mask, rows)) for s in views]
+    wrong = views[4]._replace(mask=np.rot90(views[4].mask, quarters))
+    found = mask_agreement.turns(wrong, hull.Hull(views, "scene.xml"))
+    assert found == [f"mask 4: mask or camera is turned by {90 * quarters} degrees counterclockwise: turn it back"]
+
+
+def test_a_mask_on_its_head_is_named(broken_capture, tmp_path, capsys):
+    path, _ = broken_capture
+    edit_images(path, lambda mask: mask[::-1, ::-1], "masks", "004")
+    status, text = run(path, tmp_path, capsys)
+    assert status == 1 and "Problem: 004.png: mask or camera is turned by 180 degrees counter" in text, text
 
 
 def test_few_photographs(broken_capture, tmp_path, capsys):

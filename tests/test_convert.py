@@ -32,6 +32,7 @@ from mi_ring.capture import loading
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.importers import colmap as importer
+from mi_ring.importers import reading
 from mi_ring.rendering.pinhole import Pinhole
 from mi_ring.system import command
 
@@ -162,6 +163,14 @@ def test_low_bits_of_sixteen(tmp_path, capsys, bits, largest, k1):
         np.testing.assert_allclose(rgb[0, 25, 20].numpy(), (largest - 1 + k) / 65535, rtol=1e-6)
         assert clipped[0, 25, 20].all() == (k == 1 and largest == full)
         assert not clipped[0][np.ones((H, W), bool) if valid is None else valid[0].numpy()][:W].any()
+
+
+def test_raw_files_use_all_bits(tmp_path):
+    """Developed ones are scaled, so that small values are those of dark photographs. They are not even opened."""
+    file = tmp_path / "a.png"
+    write(file, noise(np.uint16) // 16)
+    found, note = reading.saturations_of({file: "auto", tmp_path / "b.nef": "auto"})
+    assert found == {file: 4094.5 / 65535} and note.startswith("No value of 1 photographs")
 
 
 def test_low_bits_of_a_curve_are_refused(tmp_path):
@@ -527,6 +536,8 @@ def test_mistakes_are_one_line_and_leave_nothing(diligent, colmap, tmp_path, cap
     (lambda d: d.update(camera_angle_x=0), "camera_angle_x: is 0.0; must be between 0 and pi"),
     (lambda d: d.update(fl_x=-3.0), "focal lengths"),
     (lambda d: d.update(w=99, h=52), "is 62 x 52 pixels, but its camera 99 x 52"),
+    (lambda d: d.update(w=62), r"frames\[0\].h: is missing"),
+    (lambda d: d["frames"].append(d["frames"][0]), "0.png: would be the photograph of two cameras: '0' is named twice"),
     (lambda d: d.update(k4=0.1), r"frames\[0\].k4"),
     (lambda d: d.update(camera_model="FOV"), "camera_model: is FOV"),
     (lambda d: d["frames"][1].update(pl_pos=[1, 2]), r"frames\[1\].pl_pos: is of shape \(2,\); must be 3 numbers"),
@@ -541,6 +552,18 @@ def test_mistakes_in_transforms(tmp_path, edit, pattern):
     with pytest.raises(InputError, match=pattern) as error:
         convert.main(["transforms", str(source), str(tmp_path / "out/scene.xml")])
     assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("old", "new", "pattern"), [
+    ('"fl_x": 50', '"fl_x": 50, "fl_x": 60', "an object has the key 'fl_x' twice"),
+    ('"a.png"', '"a\\u0001.png"', "this name is not UTF-8, or has control characters"),
+])  # fmt: skip
+def test_what_other_readers_would_read_otherwise(tmp_path, old, new, pattern):
+    name = "a\x01.png" if "u0001" in new else "a.png"
+    source = transforms(tmp_path / "data", {"fl_x": 50}, [{"file_path": name}], lambda k: noise(np.uint8))
+    path = source / "transforms.json"
+    path.write_text(path.read_text().replace(old, new))
+    refused(["transforms", source], pattern, tmp_path / "out/scene.xml")
 
 
 def refused(arguments, pattern, out):

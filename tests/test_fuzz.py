@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from mi_ring.errors import InputError
+from mi_ring.importers.formats import FORMATS
 
 sys.path.insert(0, str(Path(__file__).parent / "fuzz"))
 from damage import damaged
@@ -23,6 +24,7 @@ CHECKS = settings(max_examples=15, derandomize=True, database=None, deadline=Non
 @pytest.mark.filterwarnings("ignore")  # of what is damaged
 def test_what_is_damaged_is_read_or_refused(tmp_path):
     """Whole files are read. Whatever is wrong, there is no other error than InputError, of one line and foreseen."""
+    assert all(any(name.startswith(form) for name in READERS) for form in FORMATS)
     for name, reader_of in READERS.items():
         (tmp_path / name).mkdir()
         try:

@@ -108,6 +108,11 @@ def exr_of(*names):
     return write
 
 
+def exr_integers(path, linear):
+    """An OpenEXR file of integers, which are numbers of things."""
+    mi.Bitmap(np.uint32(255 * linear)).write(str(path.with_suffix(".exr")))
+
+
 def exr_window(path, linear):
     """An OpenEXR file that holds a part of its picture."""
     exr(path, linear)
@@ -425,6 +430,7 @@ def test_associated_alpha_of_tiff_is_undone(tmp_path):
      "has 3 pictures; save the photograph alone"),
     (exr_of("N.X", "N.Y", "N.Z"), "has channels N.X, N.Y, N.Z, but no R, G, B"),
     (exr_of("X", "Y", "Z"), "has channels X, Y, Z, but no R, G, B"),
+    (lambda path, linear: exr_integers(path, linear), "has integers in the channels R, G, B; save them as floats"),
     (exr_of("red", "green", "blue"), "but no R, G, B"), (exr_of("Z"), "has channels Z, but no R, G, B"),
     (exr_of("a.R", "a.G", "a.B", "b.R", "b.G", "b.B"), "has the layers a, b; save the one of the photograph alone"),
     (exr_window, r"its data window \(0, 0, 29, 21\) is not its display window \(0, 0, 99, 99\)"),
@@ -558,6 +564,8 @@ def test_what_no_photograph_says_of_its_exposure_is_the_same_in_all(tmp_path):
     ([{33434: 1, 34855: 100}, {33434: 2, 34855: 200}], [100, 400]), ([{33434: 1}, {33434: 2}], [1, 2]),
     ([{33437: 2}, {33437: 4}], [1 / 4, 1 / 16]), ([{}, {}], [np.nan, np.nan]), ([{33434: 1}, {}], [1, np.nan]),
     ([{33434: 1, 33437: 2}, {33434: 1}], [1 / 4, np.nan]), ([], []),
+    ([{37377: 3.0, 37378: 2.0, 34855: 100}, {37377: -1.0, 37378: 3, 34855: 50}], [100 / 8 / 4, 50 * 2 / 8]),
+    ([{33434: 1, 37377: 5.0}, {37377: -2.0}, {37377: 10**400}], [1, 4, np.nan]),
 ])  # fmt: skip
 def test_exposures(said, expected):
     np.testing.assert_allclose(exposures_of(said), expected)

@@ -37,6 +37,7 @@ from helpers.photogrammetry_files import (
 )
 from PIL import Image
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from mi_ring import convert
 from mi_ring.errors import InputError
@@ -236,6 +237,37 @@ def test_meshrooms_poses_without_a_position_and_unknown_fields(tmp_path):
     source = SfmData(path, Path())
     assert len(taken(source)) == 2 and source.without_pose == {"a.JPG", "lost.png"}
     assert source.notes == [f"{path}: not used: intrinsics/shear (unknown), intrinsics/bend (unknown)"]
+
+
+IN_RIG = [([0.05, -0.1, 0.3], [0.1, -0.2, 0.3]), ([-0.1, 0.04, -0.2], [-0.3, 0.2, 0.15])]  #: turns and centres
+
+
+def meshroom_rig(folder):
+    """All photographs have the pose of the first one: two belong to cameras of its rig, the third to an unknown one."""
+    path = alicevision(folder, own={"type": "radial3"})
+    top = json.loads(path.read_text())
+    poses = [(Rotation.from_rotvec(turn).as_matrix(), centre) for turn, centre in [*IN_RIG, IN_RIG[0]]]
+    top["rigs"] = [{"rigId": "3", "subPoses": [
+        {"status": status, "pose": {"rotation": [*map(str, np.ravel(R, order="F"))], "center": [*map(str, centre)]}}
+        for (R, centre), status in zip(poses, ("constant", "estimated", "uninitialized"))
+    ]}]  # fmt: skip
+    for view, camera in zip(top["views"], (1, 0, 2)):
+        view |= {"poseId": "20", "isPoseIndependant": "false", "rigId": "3", "subPoseId": str(camera)}
+    path.write_text(json.dumps(top))
+    return path
+
+
+def test_meshrooms_rigs(tmp_path):
+    """A point is moved to the rig, then to the camera, each time by x -> R (x - c)."""
+    source = SfmData(meshroom_rig(tmp_path), Path())
+    frames = taken(source)
+    assert [frame.image.name for frame in frames] == ["a.JPG", "b.png"] and not source.notes
+    assert source.without_pose == {"c.jpeg", "lost.png"}
+    R, t = next(cameras())
+    for frame, (turn, centre) in zip(frames, reversed(IN_RIG), strict=True):
+        S = Rotation.from_rotvec(turn).as_matrix()
+        pixels = by_opencv(S @ R, S @ (t - centre), (FX, FY), np.array(SIZE) / 2 + OFFSET, [0] * 5, False)
+        np.testing.assert_allclose(landed(frame), pixels + 0.5, atol=1e-5)
 
 
 @pytest.mark.parametrize(("kinds", "nested"), [
@@ -500,10 +532,18 @@ def test_mistakes_in_meshrooms_intrinsics(tmp_path, own, pattern):
     refused(["sfmdata", alicevision(tmp_path, own=own)], pattern, tmp_path)
 
 
-def test_photographs_of_a_rig_are_refused(tmp_path):
-    path = alicevision(tmp_path)
-    path.write_text(path.read_text().replace('"poseId": "20",', '"poseId": "20", "isPoseIndependant": "false",', 1))
-    refused(["sfmdata", path], "rigs are not supported", tmp_path)
+@pytest.mark.parametrize(("old", "new", "pattern"), [
+    ('"rigId": "3", "subPoses"', '"rigId": "4", "subPoses"', r"views\[0\]: rigs '3': is missing"),
+    ('"subPoseId": "1"', '"subPoseId": "9"', r"views\[0\]: subPoseId: is 9; rig 3 has no such camera"),
+    ('"subPoseId": "1"', '"subPoseId": "0.5"', "subPoseId: is 0.5; rig 3 has no such camera"),
+    ('"center": ["-0.3"', '"center": ["far"', r"views\[0\]: subPoses\[1\].pose.center: is .*far"),
+])  # fmt: skip
+def test_mistakes_in_meshrooms_rigs(tmp_path, old, new, pattern):
+    path = meshroom_rig(tmp_path)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    refused(["sfmdata", path], pattern, tmp_path)
 
 
 def leaves(value, path=()):

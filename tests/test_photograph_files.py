@@ -1,6 +1,7 @@
 """Which file is the photograph of which camera, and what is said of those that are left over."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -176,8 +177,12 @@ def test_cameras_of_colmap_are_scaled_to_reduced_photographs(tmp_path, capsys):
     assert "3 cameras scaled from 62 x 52 to the 31 x 26 pixels" in capsys.readouterr().out
 
 
-def test_photographs_are_turned_as_their_cameras_are(tmp_path):
-    """Cameras are for upright photographs, files are stored on their sides: a spot comes where the camera puts it."""
+@pytest.mark.parametrize("masks", ["stored", "upright", "some", "none"])
+def test_photographs_are_turned_as_their_cameras_are(tmp_path, masks, capsys):
+    """Cameras are for upright photographs, files are stored on their sides: a spot comes where the camera puts it.
+
+    Masks are as the photographs are stored, or upright; or the first has none, whose size alone shows which it is.
+    """
     R, t = next(cameras())
     x = POINTS @ R.T + t
     size, f, c = (52, 62), (70.0, 76.0), (27.25, 28.5)
@@ -189,24 +194,37 @@ def test_photographs_are_turned_as_their_cameras_are(tmp_path):
     pose = pose @ np.diag([1.0, -1, -1, 1])
     for orientation, turn in ((6, lambda p: np.rot90(p)), (8, lambda p: np.rot90(p, -1))):
         folder = tmp_path / str(orientation)
+        folder.mkdir()
         exif = Image.Exif()
         exif[274] = orientation
-        write(folder / "m.png", np.ascontiguousarray(turn(upright)[..., :1]))
         Image.fromarray(np.ascontiguousarray(turn(upright))).save(folder / "a.png", exif=exif)
         exif[274] = 3  # its size says nothing, but the others' do
         Image.fromarray(np.ascontiguousarray(upright[::-1, ::-1])).save(folder / "b.png", exif=exif)
         exif[274] = orientation  # nor does the size of a square
         square = np.ascontiguousarray(turn(upright[5:57]))
         Image.fromarray(square).save(folder / "c.png", exif=exif)
-        frames = [{"file_path": "a.png", "mask_path": "m.png"}, {"file_path": "b.png"},
+        expected = upright, upright, upright[5:57]
+        frames = [{"file_path": "a.png"}, {"file_path": "b.png"},
                   {"file_path": "c.png", "w": 52, "h": 52, "cy": c[1] - 5}]  # fmt: skip
+        for frame, pixels in zip(frames, expected) if masks != "none" else ():
+            name, picture, own = frame["file_path"], Image.fromarray(pixels), Image.Exif()
+            if masks == "stored" or (masks == "some" and name == "b.png"):
+                with Image.open(folder / name) as stored:
+                    picture = Image.fromarray(np.array(stored))
+                    own = stored.getexif() if masks == "some" else own
+            if masks != "some" or name != "a.png":
+                frame["mask_path"] = f"m_{name}"
+                picture.save(folder / f"m_{name}", exif=own)
         frames = [frame | {"transform_matrix": pose.tolist()} for frame in frames]
         top = {"fl_x": f[0], "fl_y": f[1], "cx": c[0], "cy": c[1], "w": size[0], "h": size[1], "frames": frames}
         (folder / "transforms.json").write_text(json.dumps(top))
         scene = converted("transforms", folder, tmp_path / f"{orientation}.xml")
-        expected = upright, upright, upright[5:57]
         assert all((image == pixels).all() for image, pixels in zip(scene.images, expected, strict=True))
-        assert (scene.masks[0] == upright[..., 0]).all()
+        for mask, pixels in zip(scene.masks, expected):
+            assert mask is None or (mask == pixels[..., 0]).all()
+        assert [mask is None for mask in scene.masks] == [masks in ("none", "some"), *2 * [masks == "none"]]
+        assert ("1 masks of photographs that EXIF turns are taken to be upright" in capsys.readouterr().out) == (
+            masks == "some")  # fmt: skip
 
 
 def test_an_orientation_that_changes_no_size_is_not_applied_but_told(tmp_path, capsys):
@@ -382,4 +400,21 @@ def test_cameras_of_colmap_without_lines_of_points_are_refused(tmp_path):
     lines = [line for line in path.read_text().splitlines() if line.startswith("#") or line.endswith(".jpg")]
     path.write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"images.txt: line \d+: must be the points of the camera in the line before"):
+        converted("colmap", folder, tmp_path / "s.xml", "--images", folder.parent / "images")
+
+
+@pytest.mark.parametrize(("file", "change", "words"), [
+    ("images.txt", str.rstrip, r"images.txt: line \d+: must be the points of the camera in the line before"),
+    ("images.txt", "\ufeff{}".format, "images.txt: begins with a byte order mark"),
+    ("cameras.txt", "\ufeff{}".format, "cameras.txt: begins with a byte order mark"),
+    ("cameras.txt", lambda text: text.replace("27.25", "27,25"), "cameras.txt: has 27,25; must have decimal points"),
+    ("images.txt", lambda text: re.sub(r"(?m)^(\d+) 0\.", r"\1 0,", text), r"images.txt: line \d+: has 0,\d+; must be"),
+    ("images.txt", lambda text: re.sub(r"(?m)^(\d+) \S+ \S+ \S+ \S+", r"\1 0 0 0 0", text), "of sub/1.jpg is 0 0 0 0"),
+])  # fmt: skip
+def test_what_colmap_would_misread_is_refused(tmp_path, file, change, words):
+    folder = colmap_folder(tmp_path) / "text"
+    for name in ("rigs.txt", "frames.txt"):  # as of versions before rigs
+        (folder / name).unlink()
+    (folder / file).write_text(change((folder / file).read_text()))
+    with pytest.raises(InputError, match=words):
         converted("colmap", folder, tmp_path / "s.xml", "--images", folder.parent / "images")

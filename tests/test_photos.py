@@ -16,10 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring import photos
 from mi_ring.capture.loading import load_capture
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.images import write_image
 from mi_ring.photogrammetry.folder import Picture, find_pictures, relative_exposures, without_exposure
 from mi_ring.photogrammetry.object_masks import box_mask, kept_masks
+from mi_ring.photogrammetry.shading_trial import ASSUMED_ALBEDO
 from mi_ring.photogrammetry.structure_from_motion import SparseModel
 from mi_ring.photogrammetry.table_plane import Plane
 from mi_ring.photogrammetry.workflow import find_sheet, imported_cameras, make_upright, require_parallax
@@ -149,12 +151,38 @@ def test_geocentric_cameras_and_wrong_ones(folder):
         imported_cameras(pictures)
 
 
-def test_masks_that_the_user_brings(folder, tmp_path):
-    brought = tmp_path / "masks"
-    brought.mkdir()
+@pytest.fixture
+def brought(tmp_path):
+    """A folder of masks of the ellipsoid."""
+    folder = tmp_path / "masks"
+    folder.mkdir()
     for k, pose in enumerate(poses(20)):
         mask = np.isfinite(hit_ellipsoid(LENS.camera(pose))[0]).reshape(120, 160)
-        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(brought / f"{k:02}.png.png")
+        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(folder / f"{k:02}.png.png")
+    return folder
+
+
+def test_photographs_of_12_bits_in_16(folder, brought, tmp_path, capsys):
+    """Over-exposed pixels are known, and light and object are in the units of the files."""
+    for file in folder.glob("*.png"):
+        linear = 1.5 * srgb_to_linear(np.asarray(Image.open(file)) / np.float32(255))
+        write_image((linear.clip(0, 1) * 4095 + 0.5).astype(np.uint16), file)
+    photos.main([str(folder), str(tmp_path / "capture"), "--masks", str(brought)])
+    assert (
+        "20 photographs of 16 bits is above 4095: taken for 12 bits, over-exposed at 4095\n" in capsys.readouterr().out
+    )
+    capture = load_capture(tmp_path / "capture/scene.xml")
+    albedos = []
+    for k, shot in enumerate(capture.shots):
+        rgb, clipped, mask = (own[0].numpy() for own in capture.observe([k])[:3])
+        assert shot.saturation == pytest.approx(4094.5 / 65535) and clipped.any()
+        np.testing.assert_array_equal(clipped, rgb > 4094.6 / 65535)
+        distance = np.linalg.norm(shot.camera.position)
+        albedos.append(np.pi * rgb[mask > 0.5].mean() * distance**2 / shot.light.rgb.mean())
+    assert np.median(albedos) == pytest.approx(ASSUMED_ALBEDO, rel=0.05)
+
+
+def test_masks_that_the_user_brings(folder, brought, tmp_path):
     photos.main([str(folder), str(tmp_path / "capture"), "--masks", str(brought)])
     capture = load_capture(tmp_path / "capture/scene.xml")
     first = next(poses(20))

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from os.path import splitext
 from pathlib import Path
 
-from mi_ring.errors import InputError
+import numpy as np
+
+from mi_ring.errors import InputError, is_file
 from mi_ring.fields import Fields
 from mi_ring.foreign import require_readable
 from mi_ring.importers.camera_models import Lens, camera_to_world
@@ -101,6 +103,8 @@ class Colmap(Photogrammetry):
             except RuntimeError as error:
                 raise InputError(f"{model}: rigs: camera {image.camera_id} of {name} has no pose in its rig; let "
                                  "COLMAP estimate it") from error  # fmt: skip
+            if not np.any(image.frame.rig_from_world.rotation.quat):
+                raise InputError(f"{model}: images: the quaternion of {name} is 0 0 0 0; must have length 1")
             pose = camera_to_world(world_to_camera[:, :3], world_to_camera[:, 3])
             camera = reconstruction.cameras[image.camera_id]
             lens = Lens(camera.model_name, (camera.width, camera.height), camera.params)
@@ -115,12 +119,14 @@ def is_model(folder: Path) -> bool:
 def camera_lines(path: Path) -> Iterator[tuple[bytes, int, list[bytes]]]:
     """Yield (line of the camera, number of the next line, words of the next line) for each camera in images.txt.
 
-    In this file, two lines describe a camera. The second has the image points.
+    In this file, two lines describe a camera. The second has the image points. If it is missing at the end, its only
+    word is empty.
     """
     lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
     for number, line in lines:
         if line.strip() and not line.lstrip().startswith(b"#"):
-            yield line, number + 1, next(lines, (0, b""))[1].split()
+            _, points = next(lines, (0, None))
+            yield line, number + 1, [b""] if points is None else points.split()
 
 
 def names_in(path: Path) -> dict[int, str]:
@@ -148,7 +154,18 @@ def require_points(folder: Path) -> None:
     """
     if (folder / "images.bin").is_file():
         return
-    for _, number, words in camera_lines(path := folder / "images.txt"):
+    for path in filter(is_file, (folder / name for name in ("images.txt", "cameras.txt", "rigs.txt", "frames.txt"))):
+        content = read_as(path, "text", Path.read_bytes)
+        if content.startswith(b"\xef\xbb\xbf"):
+            raise InputError(f"{path}: begins with a byte order mark, which COLMAP does not read; save it without")
+        if path.name == "images.txt":  # has names
+            continue
+        data = re.sub(rb"^\s*#.*", b"", content, flags=re.MULTILINE)
+        if bad := re.search(rb"\S*,\S*", data):  # COLMAP would read 27 for 27,25
+            raise InputError(f"{path}: has {bad[0].decode(errors='replace')}; must have decimal points, not commas")
+    for line, number, words in camera_lines(path := folder / "images.txt"):
+        if wrong := [word for word in line.split()[:9] if not NUMBER.fullmatch(word)]:
+            raise InputError(f"{path}: line {number - 1}: has {wrong[0].decode(errors='replace')}; must be a number")
         if len(words) % 3 or not all(map(NUMBER.fullmatch, words[:30])):
             raise InputError(f"{path}: line {number}: must be the points of the camera in the line before; put an "
                              "empty line after each camera")  # fmt: skip

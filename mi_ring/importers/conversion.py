@@ -7,15 +7,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
-from mi_ring.colour_profiles import Statement
 from mi_ring.errors import InputError
 from mi_ring.image_fields import unused_fields
-from mi_ring.image_headers import KINDS, bits_of, encoding_of, encodings, require_whole, statement_of
-from mi_ring.images import LOW_BITS, largest_value, mask_values
-from mi_ring.importers.frames import Frame, Source, adapt_all, frames_of, require_frames
+from mi_ring.image_headers import KINDS, encoding_of, encodings, require_whole
+from mi_ring.images import mask_values
+from mi_ring.importers.frames import Frame, Source, adapt_all, frames_of, require_frames, turn_masks
 from mi_ring.importers.named_photographs import counted, few
 from mi_ring.importers.photograph_files import parts_of, stem_of
-from mi_ring.importers.reading import pixels_of, read_as
+from mi_ring.importers.reading import pixels_of, read_as, saturations_of
 from mi_ring.importers.writer import Writer, write_frame
 from mi_ring.scene.shot import Shot
 from mi_ring.system.progress import progress
@@ -36,6 +35,7 @@ def write_scene(source: Source) -> list[Frame]:
     frames = frames_of(source)
     require_most(source, frames)
     adapt_all(source, frames)
+    turn_masks(source, frames)
     require_frames(frames, source.src)
     for frame in frames:
         if frame.pixels is None:
@@ -76,19 +76,14 @@ def note_saturation(source: Source, frames: Sequence[Frame]) -> None:
 
     Raises InputError if their values are not linear: their curve is for 16 bits.
     """
-    stored = [f for f in frames if f.pixels is None and f.saturation == 1 and bits_of(f.image) == 16]
-    largest = largest_value(pixels_of(frame.image) for frame in stored)
-    full = next((full for full in (1023, 4095) if 0 < largest <= full), largest)
-    if full not in LOW_BITS:
-        return
+    stored = [frame for frame in frames if frame.pixels is None and frame.saturation == 1]
+    found, note = saturations_of({
+        frame.image: source.encoding if source.encoding != "auto" else frame.encoding for frame in stored
+    })  # fmt: skip
     for frame in stored:
-        encoding = source.encoding if source.encoding != "auto" else frame.encoding
-        if encoding == "srgb" or (encoding == "auto" and statement_of(frame.image) != Statement()):
-            raise InputError(f"{frame.image}: has values of {LOW_BITS[full]} bits, at most {largest}, but colours that "
-                             f"need 16 bits; multiply the values by {65536 // (full + 1)}")  # fmt: skip
-        frame.saturation = (full - 0.5) / 65535
-    source.notes.append(f"No value of {len(stored)} photographs of 16 bits is above {largest}: taken for "
-                        f"{LOW_BITS[full]} bits, over-exposed at {full}")  # fmt: skip
+        frame.saturation = found.get(frame.image, 1.0)
+    if note:
+        source.notes.append(note)
 
 
 def require_most(source: Source, frames: Sequence[Frame]) -> None:

@@ -16,6 +16,11 @@ from mi_ring.importers.named_photographs import NamedPhotographs
 from mi_ring.importers.reading import read_as
 
 EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
+#: Tags of logarithms to base 2 (APEX), with their factors, for files that lack the value itself.
+LOGARITHMS: dict[int, tuple[int, float]] = {
+    ExifTags.Base.ExposureTime: (ExifTags.Base.ShutterSpeedValue, -1.0),
+    ExifTags.Base.FNumber: (ExifTags.Base.ApertureValue, 0.5),
+}
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ def exif_values(path: Path) -> dict[int, Any]:
     Values that the file lacks are left out.
     """
     exif = read_as(path, "image", exif_of).get_ifd(ExifTags.IFD.Exif)
-    return {tag: exif[tag] for tag in EXPOSURE if tag in exif}
+    return {tag: exif[tag] for tag in (*EXPOSURE, *(tag for tag, _ in LOGARITHMS.values())) if tag in exif}
 
 
 def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
@@ -75,7 +80,7 @@ def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
     `photographs`: EXIF values by EXIF tag, for each photograph. A value that all photographs lack, for example the
     aperture of an old lens, is taken as 1.
     """
-    values = np.array([[positive(exif.get(tag)) for tag in EXPOSURE] for exif in photographs]).reshape(-1, 3)
+    values = np.array([[exposure_value(exif, tag) for tag in EXPOSURE] for exif in photographs]).reshape(-1, 3)
     unknown = np.isnan(values).all(0)
     if unknown.all():
         return [math.nan] * len(values)
@@ -83,6 +88,21 @@ def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
     with np.errstate(all="ignore"):
         exposures = seconds * iso / f_number**2
     return np.where(np.isfinite(exposures) & (exposures > 0), exposures, math.nan).tolist()
+
+
+def exposure_value(exif: Mapping[int, Any], tag: int) -> float:
+    """Return exposure time [s], ISO or aperture, by its EXIF tag; NaN if it is unknown.
+
+    `exif`: EXIF values by tag. Time and aperture may also be known by their logarithm.
+    """
+    value = positive(exif.get(tag))
+    if math.isnan(value) and tag in LOGARITHMS:
+        other, factor = LOGARITHMS[tag]
+        try:
+            return positive(2.0 ** (factor * float(exif[other])))
+        except (KeyError, TypeError, ValueError, ArithmeticError):
+            pass
+    return value
 
 
 def positive(value: Any) -> float:

@@ -112,6 +112,8 @@ def refuse_twins(
             continue
         first = [path for path, agrees in paths if agrees] or [path for path, _ in paths]
         if len(first) > 1:
+            if first[0] == first[1]:
+                raise InputError(f"{file}: would be the {what}: {first[0]!r} is named twice; remove one")
             raise InputError(f"{file}: would be the {what}, {first[0]!r} and {first[1]!r}; {advice}")
         lost |= {path for path, _ in paths} - {*first}
     return lost

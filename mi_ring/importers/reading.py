@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,8 +13,10 @@ import scipy.io
 from PIL import ExifTags
 
 from mi_ring import image_headers, images
+from mi_ring.colour_profiles import Statement
 from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading, require_readable
+from mi_ring.scene.shot import Encoding
 
 Content = TypeVar("Content")
 Key = TypeVar("Key")
@@ -35,6 +38,32 @@ def pixels_of(path: Path, heed: bool = False) -> np.ndarray:
     other types. False: return them as stored. Raises InputError if the file is damaged.
     """
     return read_as(path, "image", lambda file: images.read_image(file, heed))
+
+
+def saturations_of(files: Mapping[Path, Encoding]) -> tuple[dict[Path, float], str]:
+    """Find photographs that have values of only 10, 12 or 14 bits in files of 16 bits. Raw files are none.
+
+    `files`: encodings by image file. Returns (saturations, note): by file the encoded value (1 = full scale) from which
+    its pixels are clipped, and a sentence for the user. Both are empty if the files use all bits. Raises InputError if
+    the values are not linear: their curve is for 16 bits.
+    """
+    stored = [path for path in files if path.suffix.lower() not in image_headers.RAW and bits_of(path) == 16]
+    largest = images.largest_value(pixels_of(path) for path in stored)
+    full = next((full for full in (1023, 4095) if 0 < largest <= full), largest)
+    if not (bits := images.LOW_BITS.get(full)):
+        return {}, ""
+    for path in stored:
+        declared = files[path] == "auto" and image_headers.statement_of(path) != Statement()
+        if declared or files[path] == "srgb":
+            raise InputError(f"{path}: has values of {bits} bits, at most {largest}, but colours that need 16 bits; "
+                             f"multiply the values by {65536 // (full + 1)}")  # fmt: skip
+    note = f"No value of {len(stored)} photographs of 16 bits is above {largest}: taken for {bits} bits, over-exposed"
+    return dict.fromkeys(stored, (full - 0.5) / 65535), f"{note} at {full}"
+
+
+def bits_of(path: Path) -> int:
+    """Return the bits per channel of an image file: 8, 16, or 32 for floats."""
+    return read_as(path, "image", image_headers.bits_of)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -180,8 +209,15 @@ def load_mat(path: Path) -> dict:
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file and return its value. Raises InputError if that fails."""
-    return read_as(path, "JSON", lambda file: json.loads(file.read_bytes()))
+    """Read a JSON file and return its value. Raises InputError if that fails, or if an object has a key twice."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(found := dict(pairs)) < len(pairs):
+            key, _ = Counter(key for key, _ in pairs).most_common(1)[0]
+            raise ValueError(f"an object has the key {key[:60]!r} twice")
+        return found
+
+    return read_as(path, "JSON", lambda file: json.loads(file.read_bytes(), object_pairs_hook=unique))
 
 
 def require_object(value: Any, what: str) -> dict:

@@ -35,6 +35,8 @@ class SfmData(Photogrammetry):
             "views/path views/poseId views/viewId views/intrinsicId": "Meshroom: photograph, pose and lens",
             "poses/poseId poses/pose pose/transform transform/rotation transform/center": "Meshroom: camera-to-world",
             "pose/rotationOnly": "Meshroom: such photographs have no place, and are left out",
+            "views/isPoseIndependant views/rigId views/subPoseId rigs/rigId": "Meshroom: photographs of rigs",
+            "subPoses/status subPoses/pose pose/rotation pose/center": "Meshroom: places of the cameras in a rig",
             "intrinsics/intrinsicId intrinsics/width intrinsics/height": "Meshroom: size of the photographs",
             "intrinsics/sensorWidth intrinsics/focalLength intrinsics/pxFocalLength intrinsics/pixelRatio": "Meshroom",
             "intrinsics/principalPoint": "Meshroom: intrinsics",
@@ -45,15 +47,14 @@ class SfmData(Photogrammetry):
             "data/width data/height data/focal_length data/principal_point": "OpenMVG: intrinsics",
             "value0/width value0/height value0/focal_length value0/principal_point": "OpenMVG: intrinsics",
             "data/disto_k1 data/disto_k3 data/disto_t2 data/fisheye": "OpenMVG: distortion",
-            "views poses intrinsics extrinsics */key */value value/ptr_wrapper ptr_wrapper/data data/value0":
-                "hold the others",
+            "views poses intrinsics rigs rigs/subPoses extrinsics": "hold the others",
+            "*/key */value value/ptr_wrapper ptr_wrapper/data data/value0": "hold the others",
         },
         refused={
-            "views/isPoseIndependant": "photographs of rigs",
             "intrinsics/undistortionType": "a second model of the lens",
         },
         harmless={
-            "views/frameId views/resectionId views/rigId views/subPoseId views/ancestor* views/imageGroup*": "numbers",
+            "views/frameId views/resectionId views/ancestor* views/imageGroup*": "numbers",
             "views/width views/height": "the size is the lens's",
             "views/metadata/*": "EXIF data",
             "pose/locked pose/removable intrinsics/*[lL]ocked": "settings",
@@ -61,7 +62,6 @@ class SfmData(Photogrammetry):
             "intrinsics/serialNumber intrinsics/sensorHeight": "the camera",
             "intrinsics/undistortionOffset intrinsics/undistortionParams": "of undistortionType",
             "intrinsics/fisheyeC* intrinsics/fisheyeR*": "where a fisheye's picture ends",
-            "rigs/*": "photographs of rigs are refused if they have no pose of their own",
             "structure/* control_points/* controlPoints/* landmarks/* constraints*": "points",
             "rotationpriors/* surveypoints/* featuresFolders matchesFolders": "of the alignment",
             "sfm_data_version ptr_wrapper/id data/id_view": "numbers",
@@ -83,7 +83,7 @@ class SfmData(Photogrammetry):
         """Yield the photographs with a pose in a Meshroom file. `top`: its top-level JSON object."""
         version = tuple(matrix(top.get("version", [1, 0, 0]), (3,), f"{self.src}: version"))
         intrinsics = self.by_key(top, "intrinsics", "intrinsicId")
-        poses = self.by_key(top, "poses", "poseId")
+        poses, rigs = self.by_key(top, "poses", "poseId"), self.by_key(top, "rigs", "rigId")
         for k, view in enumerate(top["views"]):
             what = f"{self.src}: views[{k}]"
             file = file_name(require_object(view, what), "path", what)
@@ -91,16 +91,16 @@ class SfmData(Photogrammetry):
             if own is None:
                 self.without_pose.add(PureWindowsPath(file).name)
                 continue
-            if str(view.get("isPoseIndependant", True)).lower() == "false":
-                raise InputError(f"{what}: isPoseIndependant: is false; photographs of rigs are not supported")
             place = require_object(own.get("pose"), f"{what}: pose")
             if str(place.get("rotationOnly")).lower() in ("true", "1"):
                 self.without_pose.add(PureWindowsPath(file).name)
                 continue
-            transform = require_object(place.get("transform"), f"{what}: pose.transform")
-            # The file has the world-to-camera rotation by columns. Read by rows, it is the camera-to-world rotation.
-            R = matrix(transform.get("rotation"), (9,), f"{what}: pose.rotation").reshape(3, 3)
-            pose = pose_of(R, matrix(transform.get("center"), (3,), f"{what}: pose.center"))
+            pose = alicevision_pose(place.get("transform"), f"{what}: pose")
+            if str(view.get("isPoseIndependant", True)).lower() in ("false", "0"):  # the pose is that of the rig
+                if (in_rig := rig_pose(rigs, view, what)) is None:
+                    self.without_pose.add(PureWindowsPath(file).name)
+                    continue
+                pose = pose @ in_rig
             key = str(view.get("intrinsicId"))
             intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
             lens = alicevision_lens(intrinsic, version, f"{self.src}: intrinsic {key!r}")
@@ -186,6 +186,33 @@ def type_number(value: dict, path: Path) -> int:
     InputError if there is no number.
     """
     return int(matrix(value.get("polymorphic_id"), (), f"{path}: intrinsics: polymorphic_id")) & 0x7FFFFFFF
+
+
+def alicevision_pose(transform: Any, what: str) -> np.ndarray:
+    """Return the pose (4, 4) in a JSON object of AliceVision: camera-to-world, or camera-to-rig.
+
+    Raises InputError if it is invalid. The message begins with `what`.
+    """
+    own = require_object(transform, what)
+    # The file has the rotation of world to camera by columns. Read by rows, it is the rotation of camera to world.
+    R = matrix(own.get("rotation"), (9,), f"{what}.rotation").reshape(3, 3)
+    return pose_of(R, matrix(own.get("center"), (3,), f"{what}.center"))
+
+
+def rig_pose(rigs: dict[str, Any], view: dict, what: str) -> np.ndarray | None:
+    """Return the camera-to-rig pose (4, 4) of a photograph; None if AliceVision has not found it.
+
+    `rigs`: JSON objects of the rigs by number. `view`: JSON object of the photograph. Raises InputError if there is no
+    such rig or camera. The message begins with `what`.
+    """
+    rig, number = str(view.get("rigId")), matrix(view.get("subPoseId"), (), f"{what}: subPoseId")
+    cameras = require_object(rigs.get(rig), f"{what}: rigs {rig!r}").get("subPoses")
+    if not isinstance(cameras, list) or number not in range(len(cameras)):
+        raise InputError(f"{what}: subPoseId: is {number:g}; rig {rig} has no such camera")
+    camera = require_object(cameras[int(number)], f"{what}: subPoses")
+    if str(camera.get("status")).lower() == "uninitialized":
+        return None
+    return alicevision_pose(camera.get("pose"), f"{what}: subPoses[{number:g}].pose")
 
 
 def alicevision_lens(own: dict, version: tuple, what: str) -> Lens:

@@ -130,7 +130,8 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
             raise InputError(f"{where}.{name}: is {value}; must be between 0 and pi")
         return value
 
-    size: Any = (number("w"), number("h")) if "w" in given and "h" in given else image_size(image)  # Lens truncates
+    said = [name for name in ("w", "h") if given.get(name) is not None]
+    size: Any = (number("w"), number("h")) if said else image_size(image)  # Lens truncates
     width, height = size
     for name in given:
         kind, why = Transforms.fields.kind_of(name)

@@ -17,7 +17,7 @@ from mi_ring.errors import InputError
 from mi_ring.image_headers import bits_of
 from mi_ring.images import mask_values, oriented, write_image
 from mi_ring.importers.frames import Frame
-from mi_ring.importers.reading import image_size, pixels_of
+from mi_ring.importers.reading import pixels_of
 from mi_ring.importers.undistortion import undistort
 from mi_ring.scene.shot import Encoding, Files
 from mi_ring.system.files import relative_to, write_file
@@ -121,10 +121,9 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
         return Files(image, image if file else None, valid)
 
     def mask() -> np.ndarray | None:
-        turned = turn > 1 and image_size(file) != frame.lens.size
-        if straight and not frame.fill_mask and not turned:
+        if straight and not frame.fill_mask and frame.mask_orientation == 1:
             return None
-        mask = oriented(mask_values(pixels_of(file), f"{file}: mask"), turn if turned else 1)[..., None]
+        mask = oriented(mask_values(pixels_of(file), f"{file}: mask"), frame.mask_orientation)[..., None]
         if frame.fill_mask:
             mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
         return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]

@@ -5,6 +5,7 @@ A pixel of a mask is confirmed if its ray hits the visual hull of all masks.
 
 import copy
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
     def shares(hull: Hull) -> np.ndarray:
         return (hull.shortfall(silhouettes, pixels) < 1).mean(1)
 
-    agree, why = shares(capture.hull), None
+    agree, why, turned = shares(capture.hull), None, list[str]()
     if capture.whole and agree.min() < CONFORMS:
         whole = [silhouette.whole for silhouette in subsample(silhouettes, 32, 96)]
         why = mistake(whole) if np.median(agree) < CONFORMS else None
@@ -41,14 +42,28 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
             robust = shares(tolerant)
             if np.median(robust) >= CONFORMS:
                 agree = robust
+                turned = [word for k in np.flatnonzero(robust < CONFORMS) for word in turns(silhouettes[k], tolerant)]
             else:
                 why = "cameras or masks are wrong"
-    wrong = [f"The masks agree to {agree.mean():.0%} only: {why}"] if why else []
+    wrong = [f"The masks agree to {agree.mean():.0%} only: {why}"] if why else turned
     if not why and capture.whole and np.median([border(silhouette.whole) for silhouette in silhouettes]) > AROUND:
         wrong = [
             "masks cover the border of most photographs: are they inverted? 255 is to be the object, 0 the background"
         ]
     return {silhouette.name: float(a) for silhouette, a in zip(silhouettes, agree)}, wrong
+
+
+def turns(silhouette: Silhouette, hull: Hull) -> list[str]:
+    """List the angles by which the mask of a photograph may be turned: turned back, it agrees with the hull of all.
+
+    Returns sentences for the user. Angles of 90 and 270 degrees are tried if the mask is square.
+    """
+    mask = silhouette.whole.mask
+    quarters = (1, 2, 3) if mask.shape[0] == mask.shape[1] else (2,)
+    back = [silhouette.whole._replace(mask=np.rot90(mask, -k)) for k in quarters]
+    agree = (hull.shortfall(back) < 1).mean(1)
+    return [f"{Path(silhouette.name).name}: mask or camera is turned by {90 * k} degrees counterclockwise: turn it back"
+            for k, share in zip(quarters, agree) if share >= CONFORMS]  # fmt: skip
 
 
 def with_camera(silhouette: Silhouette, **changed: Any) -> Silhouette:
@@ -69,7 +84,8 @@ MATRICES = {
 #: Mistakes in the camera axes, and the signs that correct them.
 AXES = {
     "": (1, 1, 1),
-    "its axes are OpenCV's (COLMAP's), x right, y down: to_world @ diag(-1, -1, 1, 1)": (-1, -1, 1),
+    "its axes are OpenCV's (COLMAP's), x right, y down: to_world @ diag(-1, -1, 1, 1); or all masks are turned by 180 "
+    "degrees": (-1, -1, 1),
     "its axes are OpenGL's (NeRF's, Blender's), x right, y up: to_world @ diag(-1, 1, -1, 1)": (-1, 1, -1),
     "its y and z are flipped: to_world @ diag(1, -1, -1, 1)": (1, -1, -1),
 }

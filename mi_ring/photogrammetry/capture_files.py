@@ -71,7 +71,7 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
     if posed.lens.is_pinhole:
         crop, shown = pixels[top : top + height, left : left + width], np.ones((height, width), bool)
     else:
-        crop, shown = undistort(pixels, posed.lens, picture.encoding == "srgb", window=window)
+        crop, shown = undistort(pixels, posed.lens, picture.encoding == "srgb", picture.saturation, window)
     picture.close()
 
     def write_binary(folder: str, mask: np.ndarray) -> Path:
@@ -88,7 +88,7 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
     camera = posed.lens.camera(posed.pose)
     camera = camera._replace(centre=camera.centre - [left, top], size=(width, height))
     return photograph_element(Shot(picture.name, camera, posed.light, posed.falloff, Response(posed.gamma),
-                                   Files(filename, mask, valid), encoding))  # fmt: skip
+                                   Files(filename, mask, valid), encoding, picture.saturation))  # fmt: skip
 
 
 def write_table(
@@ -102,7 +102,7 @@ def write_table(
 
     def observe(posed: PosedPicture) -> tuple[ReducedView, np.ndarray, Light]:
         view = reduce_photograph(posed.picture, posed.lens, posed.pose, Window.whole(posed.lens, TABLE_PIXELS))
-        # Views of raw photographs are divided by their white. So must the light be.
+        # Views of linear photographs are divided by their white. So must the light be.
         white = posed.picture.white if posed.picture.encoding == "linear" else 1.0
         light = posed.light._replace(rgb=posed.light.rgb / white)
         posed.picture.close()

@@ -3,7 +3,7 @@
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from mi_ring.image_headers import HEIF, KINDS, RAW, SUFFIXES, encoding_of, exif_
 from mi_ring.images import linear_to_srgb, mask_values, orientation_axes, oriented, read_image
 from mi_ring.importers.named_photographs import MASK_AFFIX
 from mi_ring.importers.photogrammetry import exposures_of
-from mi_ring.importers.reading import image_size, read_as
+from mi_ring.importers.reading import image_size, read_as, saturations_of
 from mi_ring.scene.shot import Encoding
 from mi_ring.system import command
 from mi_ring.system.optional import need
@@ -35,6 +35,7 @@ class Picture:
 
     path: Path
     upright: bool = True  #: turn the pixels by the EXIF orientation; cameras of other tools need them as stored
+    saturation: float = 1.0  #: encoded value (1 = full scale) from which a pixel is clipped
 
     @property
     def name(self) -> str:
@@ -148,7 +149,7 @@ class Picture:
         return np.array(Image.fromarray(rgb[:height, :width]).convert("L").reduce(scale))
 
     def srgb(self) -> np.ndarray:
-        """Return the photograph as 8-bit sRGB, (H, W, 3) uint8. A raw file is scaled to a usual brightness."""
+        """Return the photograph as 8-bit sRGB, (H, W, 3) uint8, in which `white` is white."""
         rgb = self.pixels[:, :, :3]
         if rgb.dtype == np.uint8:
             return rgb
@@ -160,10 +161,10 @@ class Picture:
     def white(self) -> float:
         """The linear value of `pixels` that is shown as white (1 = full scale).
 
-        For a raw file, it is near the brightest pixel, because its scale is arbitrary. For other files, it is 1.
+        For a raw file, it is near the brightest pixel, because its scale is arbitrary. For others, it is `saturation`.
         """
         if not self.raw:
-            return 1.0
+            return self.saturation
         return max(float(np.quantile(self.pixels[::8, ::8, :3], 0.995)) / 65535, 1e-3)
 
     def to_linear(self, pixels: np.ndarray) -> np.ndarray:
@@ -315,6 +316,15 @@ def relative_exposures(pictures: Sequence[Picture], unknown: float = 1.0) -> np.
     exposures = exif_exposures(pictures)
     known = np.isfinite(exposures)
     return np.where(known, exposures / np.median(exposures[known]) if known.any() else 1.0, unknown)
+
+
+def with_saturations(pictures: Sequence[Picture]) -> tuple[list[Picture], str]:
+    """Return the photographs with their saturations, and a sentence about these for the user; empty if all are 1.
+
+    Raises InputError if values of 10, 12 or 14 bits in a file of 16 bits are not linear.
+    """
+    found, note = saturations_of(dict.fromkeys((picture.path for picture in pictures), "auto"))
+    return [replace(picture, saturation=found.get(picture.path, 1.0)) for picture in pictures], note
 
 
 def without_flash(pictures: Sequence[Picture]) -> list[str]:

@@ -27,7 +27,7 @@ MAX_STRAY = 0.25  #: a corner is an outlier if it is farther from where the othe
 MAX_RMS = 0.02  #: largest rms error of the triangulated corners [width of the sheet that is seen]
 MAX_ANGLE = 0.002  #: an observation is an outlier if its ray is farther from the triangulated corner [radians]
 MIN_PARALLAX = 0.02  #: between the rays from which a corner is triangulated [radians]
-CLIPPED = 0.95  #: linear colour (1 = full scale) from which paper may be overexposed
+CLIPPED = 0.95  #: linear colour (1 = saturation) from which paper may be overexposed
 #: Where paper is white, relative to the first corner of a square [squares]: in a white square, half way between its
 #: edge and the marker, one side after another; in the margin, left of, right of and above the outermost squares.
 INNER = (1 - MARKER) / 4
@@ -234,12 +234,14 @@ class PaperSamples(NamedTuple):
 
 
 def sample_paper(
-    photograph: np.ndarray, detection: SheetDetection, linear: Callable[[np.ndarray], np.ndarray] = np.asarray
-) -> PaperSamples:
+    photograph: np.ndarray, detection: SheetDetection, linear: Callable[[np.ndarray], np.ndarray] = np.asarray,
+    saturation: float = 1.0,
+) -> PaperSamples:  # fmt: skip
     """Sample the colours of the sheet's white squares and of the page's margin in a photograph (H, W, 3).
 
     Each sample is a median of several pixels. Overexposed samples are left out. `linear`: function that decodes a part
     of the photograph to linear float32; it is called for parts because the whole would need too much memory.
+    `saturation`: linear value from which pixels are clipped (1 = full scale).
     """
 
     def sample(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
@@ -267,7 +269,7 @@ def sample_paper(
             if outermost:
                 colour = np.median(sample(place + PATCH, plane), 0)  # NaN if partly outside
                 samples.append((first + place @ sides, colour, True))
-    samples = [sample for sample in samples if sample[1].max() < CLIPPED]
+    samples = [sample for sample in samples if sample[1].max() < CLIPPED * saturation]
     where, colours, in_margin = zip(*samples) if samples else ((), (), ())
     return PaperSamples(np.reshape(where, (-1, 3)), np.reshape(colours, (-1, 3)), np.array(in_margin, bool))
 

@@ -40,7 +40,7 @@ class SegmentedObject(NamedTuple):
 
     masks: dict[str, np.ndarray]  #: (H, W) uint8 of `OBJECT`, `UNKNOWN` and 0, by the photograph's name
     center: np.ndarray  #: (3,)
-    radiance: float  #: mean radiance of the object (1 = full scale)
+    radiance: float  #: mean radiance of the object (1 = white of the photographs)
     plane: Plane | None  #: the table under the object; None if there is none
 
 

@@ -97,8 +97,10 @@ def find_sheet(
                     raise InputError("{}: is {} x {} pixels; the shorter side must be at least {}, and an {}th of the "
                                      "longer one".format(picture.path, *picture.size, SMALLEST, FLATTEST))  # fmt: skip
                 detection = MarkerSheet(1.0).detect(picture.srgb())
-                paper = sample_paper(picture.pixels[:, :, :3], detection, picture.to_linear) if detection else ()
-                return [a.tolist() for a in (*detection, *paper)] if detection else None
+                if detection is None:
+                    return None
+                paper = sample_paper(picture.pixels[..., :3], detection, picture.to_linear, picture.saturation)
+                return [a.tolist() for a in (*detection, *paper)]
             except InputError as error:
                 if isinstance(error.__cause__, ImportError):  # a package is missing: the file is fine
                     raise
@@ -256,7 +258,7 @@ def posed_pictures(
     result, placed = [], [picture for picture in pictures if picture.name in sparse.cameras]
     for picture, exposure in zip(placed, relative_exposures(placed)):
         name, (lens, pose) = picture.name, sparse.cameras[picture.name]
-        intensity = known.get(name, exposure * (flash.power if flash else assumed))
+        intensity = known.get(name, exposure * (flash.power if flash else assumed * picture.saturation))
         light = Light("point", pose[:3, :3] @ offsets[name] + pose[:3, 3], intensity)
         result.append(PosedPicture(picture, lens, pose, found.masks.get(name), light, name in known, falloff, gamma))
     return result

@@ -58,11 +58,18 @@ def parse(
     return config
 
 
+CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")  #: characters that XML cannot express
+
+
 def require_utf8(name: str) -> None:
-    """Raise InputError if a file name is not UTF-8. The file system itself allows any bytes."""
-    printable = os.fsencode(name).decode(errors="replace")
+    """Raise InputError if a file name is not UTF-8, or if it has a character that XML cannot express.
+
+    The file system itself allows any bytes.
+    """
+    printable = CONTROL.sub("\ufffd", os.fsencode(name).decode(errors="replace"))
     if printable != name:
-        raise InputError(f"{printable}: this name is not UTF-8, which Mitsuba and XML need; rename it")
+        raise InputError(f"{printable}: this name is not UTF-8, or has control characters, which XML and Mitsuba do "
+                         "not allow; rename it")  # fmt: skip
 
 
 def complaint_in(box: str) -> str:

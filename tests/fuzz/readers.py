@@ -125,7 +125,13 @@ def alicevision(folder: Path) -> Reader:
     files = []
     for version in ("1.2.0", "1.2.14"):
         own = {"distortionType": "radialk3", "type": "radial3", "distortionParams": [0.1, 0.02, 0.01]}
-        files.append(photogrammetry_files.alicevision(folder, version, own).rename(folder / f"{version}.sfm"))
+        path = photogrammetry_files.alicevision(folder, version, own)
+        top = json.loads(path.read_text())
+        top["views"][0] |= {"isPoseIndependant": "false", "rigId": "3", "subPoseId": "0"}
+        pose = {"rotation": ["1", "0", "0", "0", "1", "0", "0", "0", "1"], "center": ["1", "2", "3"]}
+        top["rigs"] = [{"rigId": "3", "subPoses": [{"status": "constant", "pose": pose}]}]
+        files.append(path.with_name(f"{version}.sfm"))
+        files[-1].write_text(json.dumps(top))
     return Reader(files, lambda: [imported(SfmData)(path)() for path in files])
 
 
