@@ -557,8 +557,8 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
 def test_a_fit_finds_a_flash_that_is_not_where_it_is_said_to_be(small_capture, tmp_path):
     wrong = np.array([-6.0, -16.0, 4.0])  # beyond a tenth of the distance
     scene = edited(small_capture, tmp_path / "wrong", lambda element: move_light(element, wrong))
-    config = Config(iterations=80, levels=(3,), widths=(56,), shares=(1,), refine=("light",), velocity_decay=0.3,
-                    batch=4, subdivisions=3)  # fmt: skip
+    config = Config(iterations=80, levels=(2,), widths=(56,), shares=(1,), refine=("light",), velocity_decay=0.3,
+                    batch=4, subdivisions=3, indirect=False, detail="none")  # fmt: skip
     running = Fit(mi_ring.load_capture(scene), config)
     for _ in running:
         pass

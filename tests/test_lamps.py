@@ -146,7 +146,7 @@ def test_lamps_that_the_scene_says_roughly_are_refined(under_two_lamps, tmp_path
     text = text.replace("{}", said.format(*wrong.vector, *(0.75 * lamp.rgb)) + "</emitter>").replace('"../', '"')
     scene.write_text(text)
     capture = mi_ring.load_capture(scene)
-    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, refine=("lamps",)))
+    fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY, refine=("lamps",), indirect=False))
     assert fit.model.calibration.refined == ("lamps",)
     list(fit)
     refined = fit.calibrated()

@@ -201,14 +201,14 @@ def test_a_dark_room_that_stays_as_it_is_does_not_matter(small_capture, tmp_path
     scene = tmp_path / "capture/small.xml"
     room = '<emitter type="room"><string name="frame" value="camera"/><string name="harmonics" value="{}"/></emitter>'
     scene.write_text(scene.read_text().replace("</scene>", room.format(" ".join(["0"] * 27)) + "</scene>"))
-    changes = TINY | {"iterations": 1, "refine": ("none",)}
+    changes = TINY | {"iterations": 1, "refine": ("none",), "indirect": True}
     fit = mi_ring.Fit(mi_ring.load_capture(scene), mi_ring.Config.preset("fast", **changes))
     assert fit.ring.indirect and np.isfinite(fit.step().loss)
 
 
 def test_a_fit_goes_on_under_the_light_that_it_has_found(in_an_environment):
     capture = mi_ring.load_capture(in_an_environment)
-    config = mi_ring.Config.preset("fast", **TINY, light="environment")
+    config = mi_ring.Config.preset("fast", **TINY | {"indirect": True}, light="environment")
     fit = mi_ring.Fit(capture, config, lighting=Lighting("environment", one_material_until=0.6))
     fit.step(), fit.step()
     resumed = mi_ring.Fit(capture, config, state=fit.state())

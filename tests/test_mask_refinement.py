@@ -14,7 +14,7 @@ from mi_ring.fitting import fit as fitting
 from mi_ring.fitting import mask_refinement
 
 WITHOUT = [1, 4, 5, 10]  #: photographs whose masks are taken away
-BRIEF = {"iterations": 40, "levels": (3,), "widths": (56,), "shares": (1,), "subdivisions": 3}
+BRIEF = {"iterations": 40, "levels": (3,), "widths": (56,), "shares": (1,), "subdivisions": 3, "indirect": False}
 
 
 def ellipse(x, y, rows=50, columns=70):

@@ -85,7 +85,7 @@ sys.exit(command.main(sys.argv[3:]))
 """
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--subdivisions", "3", "--batch", "5",
          "--iterations", "8", "--deterministic", "--domain", "sphere",
-         "--precision", "float32"]  # fmt: skip
+         "--precision", "float32", "--no-indirect"]  # fmt: skip
 
 
 def torchrun(*arguments):

@@ -6,6 +6,7 @@ from mi_ring.images import write_image
 
 TINY = {
     "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
+    "indirect": False,  # of a convex object there is none
 }  # fmt: skip
 TOWARD = np.array([0.48, 0.6, -0.64])  #: the brightest direction of `lobe`, a unit vector
 
