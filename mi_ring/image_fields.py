@@ -116,7 +116,7 @@ def field_names(path: Path) -> tuple[str, list[str]]:
     if suffix == ".exr":
         attributes = dict(exr_attributes(path))
         channels = exr_channels(attributes[b"channels"])
-        others = [name for name in channels if name not in exr_picture([*channels])]
+        others = [name for name in channels if name not in exr_picture(channels)]
         return "OpenEXR", [*(name.decode("utf-8", "replace") for name in attributes), *map("channel:{}".format, others)]
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:

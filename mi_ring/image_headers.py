@@ -7,7 +7,7 @@ import math
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -170,7 +170,7 @@ def has_alpha_channel(path: Path) -> bool:
     if suffix in (".jpg", ".jpeg", *RAW):
         return False
     if suffix == ".exr":
-        names = [*exr_channels(dict(exr_attributes(path))[b"channels"])]
+        names = exr_channels(dict(exr_attributes(path))[b"channels"])
         return any(name.rpartition(".")[2] == "A" for name in names)
     if suffix in TIFF:
         with tifffile.TiffFile(path) as file:
@@ -309,12 +309,13 @@ def exr_channels(value: bytes) -> dict[str, int]:
     return kinds
 
 
-def exr_picture(names: Sequence[str]) -> list[str]:
+def exr_picture(channels: Iterable[str]) -> list[str]:
     """Choose the channels of an OpenEXR file that form the picture: R, G, B and A; or Y and A; or the only channel.
 
-    `names`: all channel names. A name may begin with a layer, as in `ViewLayer.Combined.R`. Returns the chosen names in
-    this order; a file may lack A. Raises ValueError if no channels form a picture, or if several layers do.
+    `channels`: all channel names. A name may begin with a layer, as in `ViewLayer.Combined.R`. Returns the chosen names
+    in this order; a file may lack A. Raises ValueError if no channels form a picture, or if several layers do.
     """
+    names = [*channels]
     layers = [name.removesuffix("R") for name in names if name == "R" or name.endswith(".R")]
     layers = [layer for layer in layers if {f"{layer}{c}" for c in "RGB"} <= {*names}]
     layers = [""] if "" in layers else layers
@@ -338,7 +339,7 @@ def exr_size(path: Path) -> tuple[int, int, int]:
     kinds = exr_channels(found[b"channels"])
     if min(right - left, bottom - top, len(kinds) - 1) < 0:
         raise ValueError("declares no pixels")
-    if integers := [name for name in exr_picture([*kinds]) if not kinds[name]]:
+    if integers := [name for name in exr_picture(kinds) if not kinds[name]]:
         raise ValueError(f"has integers in the channels {', '.join(integers)}; save them as floats")
     if data != (whole := struct.unpack("<4i", found.get(b"displayWindow", found[b"dataWindow"]))):
         raise ValueError(f"its data window {data} is not its display window {whole}; save the whole picture")

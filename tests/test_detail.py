@@ -9,10 +9,12 @@ import torch
 import trimesh
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.fitting import agreeing_adam
 from mi_ring.fitting.agreeing_adam import AgreeingAdam
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import add_detail, detail_levels, unfold
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.optimisation import detail_steppers
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
@@ -195,6 +197,24 @@ def test_values_move_where_gradients_agree_and_stay_where_they_do_not():
     deviation = [math.sqrt(0.1 / 1.9 * (1 + 0.9**t) / (1 - 0.9**t)) for t in range(1, 201)]
     assert float(steady[1]) == pytest.approx(0.01 * sum(max(0, 1 - 2 * d) for d in deviation), rel=1e-4)
     assert moved.abs().mean() < 0.05 * steady[1]
+
+
+def test_values_in_parts_move_as_all_at_once(monkeypatch):
+    gradients = torch.randn(30, 50, generator=torch.Generator().manual_seed(2)) + 0.5
+    whole = descend(gradients)
+    monkeypatch.setattr(agreeing_adam, "AT_ONCE", 7)
+    assert whole.any() and torch.equal(descend(gradients), whole)
+
+
+@pytest.mark.parametrize(("kind", "expected"), [("shape", [0.2]), ("texture", [0.6]), ("both", [0.2, 0.6])])
+def test_textures_change_three_times_as_fast_as_displacements(kind, expected):
+    ring = small()
+    add_detail(ring, 4, 20)
+    [stepper] = detail_steppers(ring, dataclasses.replace(SMALL, detail=kind, detail_rate=0.2))
+    assert [rate.initial for rate in stepper.rates] == pytest.approx(expected)
+    nets = [net for net, name in ((ring.shape_net, "shape"), (ring.brdf_net, "texture")) if kind in (name, "both")]
+    for group, net in zip(stepper.optimizer.param_groups, nets, strict=True):
+        assert [id(p) for p in group["params"]] == [id(p) for p in net.grid.parameters()]
 
 
 def test_iterations_that_do_not_show_a_value_change_nothing_of_it():

@@ -15,7 +15,7 @@ from trimesh.creation import box, icosphere, torus
 from mi_ring import evaluate, render
 from mi_ring.capture import loading, scenefile
 from mi_ring.errors import InputError
-from mi_ring.geometry.meshes import genus
+from mi_ring.geometry.meshes import area_vectors, genus
 from mi_ring.metrics import image_errors, surfaces
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
@@ -186,6 +186,15 @@ def test_one_needle_through_three_sheets():
 def test_what_does_not_cross_itself(mesh):
     for surface in (mesh, moved(mesh, 3)):
         assert self_intersections(surface) == 0
+
+
+def test_area_vectors_of_a_closed_surface():
+    mesh = moved(torus(1, 0.3))
+    points = torch.from_numpy(np.array(mesh.vertices))
+    faces = torch.from_numpy(np.array(mesh.faces))
+    vectors = area_vectors(points, faces)
+    assert float(vectors.norm(dim=1).sum() / 2) == pytest.approx(mesh.area)
+    assert float((vectors * points[faces].mean(1)).sum() / 6) == pytest.approx(mesh.volume)  # outward, by Gauss
 
 
 def test_genus_of_all_pieces():

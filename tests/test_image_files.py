@@ -109,7 +109,7 @@ def exr_of(*names):
 
 
 def exr_integers(path, linear):
-    """An OpenEXR file of integers, which are numbers of things."""
+    """An OpenEXR file of integers. Such channels hold numbers of objects, for example, not colours."""
     mi.Bitmap(np.uint32(255 * linear)).write(str(path.with_suffix(".exr")))
 
 
@@ -430,7 +430,7 @@ def test_associated_alpha_of_tiff_is_undone(tmp_path):
      "has 3 pictures; save the photograph alone"),
     (exr_of("N.X", "N.Y", "N.Z"), "has channels N.X, N.Y, N.Z, but no R, G, B"),
     (exr_of("X", "Y", "Z"), "has channels X, Y, Z, but no R, G, B"),
-    (lambda path, linear: exr_integers(path, linear), "has integers in the channels R, G, B; save them as floats"),
+    (exr_integers, "has integers in the channels R, G, B; save them as floats"),
     (exr_of("red", "green", "blue"), "but no R, G, B"), (exr_of("Z"), "has channels Z, but no R, G, B"),
     (exr_of("a.R", "a.G", "a.B", "b.R", "b.G", "b.B"), "has the layers a, b; save the one of the photograph alone"),
     (exr_window, r"its data window \(0, 0, 29, 21\) is not its display window \(0, 0, 99, 99\)"),

@@ -392,6 +392,7 @@ def refused(arguments, pattern, folder):
     (f'width="{W}"', 'width="61"', "photograph: is 62 x 52 pixels, but its camera 61 x 52"),
     ('type="frame"', 'type="spherical"', "type: is 'spherical'; must be frame or fisheye"),
     ("calibration", "calibrations", "calibration: is missing"),
+    ("</sensors>", '<sensor id="4"/></sensors>', "sensor: two have the id '4'"),
     ("<scale>2.5", "<scale>0", "scale: is 0.0; must be above 0"),
     ("<rotation locked='0'>", "<rotation locked='0'>1 ", r"rotation: is of shape \(10,\)"),
 ])  # fmt: skip

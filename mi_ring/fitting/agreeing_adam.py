@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-AT_ONCE = 2**20  #: values: the intermediate results of all would take much memory
+AT_ONCE = 2**20  #: values of a step that are computed together; more would take more memory for intermediate results
 
 
 class AgreeingAdam(torch.optim.Optimizer):

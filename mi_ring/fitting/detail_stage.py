@@ -55,7 +55,7 @@ def add_detail(ring: FittedObject, level: int, resolution: float) -> None:
     s, faces = ring.domain.sample(level)
     s, corners = s.to(ring.center.device), torch.from_numpy(faces).to(ring.center.device)
     domain, surface = area_vectors(s, corners), area_vectors(ring.shape_net(s), corners)
-    stretch = math.sqrt(surface.norm(dim=1).sum() / domain.norm(dim=1).sum())  # of the domain by the flow
+    stretch = math.sqrt(surface.norm(dim=1).sum() / domain.norm(dim=1).sum())  # of lengths on the domain, by the flow
     around = torch.cat([s, s[corners].mean(1)]).cpu()
     grid = Grid.around(around, CELL / stretch / resolution, OCTAVES, channels=1)
     normals = torch.zeros_like(s).index_add(0, corners.ravel(), surface.repeat_interleave(3, 0))

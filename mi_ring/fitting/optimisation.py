@@ -26,7 +26,7 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.machine import has_fast_bfloat16
 
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
-TEXTURE = 3.0  #: longest step of a value of a texture's details, as a multiple of that of a displacement
+TEXTURE_FACTOR = 3.0  #: longest step of a value of a texture, by the longest step of a displacement
 CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one makes it diverge
 
 
@@ -60,7 +60,7 @@ def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepp
 
 def detail_steppers(ring: FittedObject, config: Config) -> list[Stepper]:
     """Make the optimiser of the details."""
-    nets: dict[str, tuple[Any, float]] = {"shape": (ring.shape_net, 1.0), "texture": (ring.brdf_net, TEXTURE)}
+    nets: dict[str, tuple[Any, float]] = {"shape": (ring.shape_net, 1.0), "texture": (ring.brdf_net, TEXTURE_FACTOR)}
     chosen = [nets[name] for name in nets if config.detail in (name, "both")]
     optimizer = AgreeingAdam([{"params": [*net.grid.parameters()]} for net, _ in chosen], config.detail_rate)
     return [Stepper(optimizer, [Rate(factor * config.detail_rate, config.decay) for _, factor in chosen])]

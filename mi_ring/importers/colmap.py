@@ -71,7 +71,7 @@ class Colmap(Photogrammetry):
         model = self.model(self.src)
         if model is None:
             raise InputError(f"{self.src}: SRC: neither images.bin nor images.txt, nor a folder sparse/0 with them")
-        require_points(model)
+        require_text(model)
         siblings = [model.parent, *model.parent.iterdir()] if model == self.src else self.models(self.src)
         others = [folder for folder in sorted(siblings) if is_model(folder) and folder != model]
         if sizes := ", ".join(f"{folder} ({count_images(folder)})" for folder in others):
@@ -116,17 +116,17 @@ def is_model(folder: Path) -> bool:
     return any((folder / name).is_file() for name in ("images.bin", "images.txt"))
 
 
-def camera_lines(path: Path) -> Iterator[tuple[bytes, int, list[bytes]]]:
+def camera_lines(path: Path) -> Iterator[tuple[bytes, int, list[bytes] | None]]:
     """Yield (line of the camera, number of the next line, words of the next line) for each camera in images.txt.
 
-    In this file, two lines describe a camera. The second has the image points. If it is missing at the end, its only
-    word is empty.
+    In this file, two lines describe a camera. The second has the image points; its words are None if the
+    file ends before it.
     """
     lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
     for number, line in lines:
         if line.strip() and not line.lstrip().startswith(b"#"):
             _, points = next(lines, (0, None))
-            yield line, number + 1, [b""] if points is None else points.split()
+            yield line, number + 1, None if points is None else points.split()
 
 
 def names_in(path: Path) -> dict[int, str]:
@@ -147,10 +147,11 @@ def count_images(folder: Path) -> int:
     return sum(1 for _ in camera_lines(folder / "images.txt"))
 
 
-def require_points(folder: Path) -> None:
-    """Raise InputError if a camera in images.txt has no second line, which has its image points and may be empty.
+def require_text(folder: Path) -> None:
+    """Raise InputError if COLMAP would misread the text files of a model. Binary models are not checked.
 
-    COLMAP would otherwise read the next camera as points and lose it. Binary models are not checked.
+    It would ignore the digits after a decimal comma. If a camera in images.txt has no second line, which has its image
+    points and may be empty, it would read the next camera as points and lose it.
     """
     if (folder / "images.bin").is_file():
         return
@@ -158,14 +159,14 @@ def require_points(folder: Path) -> None:
         content = read_as(path, "text", Path.read_bytes)
         if content.startswith(b"\xef\xbb\xbf"):
             raise InputError(f"{path}: begins with a byte order mark, which COLMAP does not read; save it without")
-        if path.name == "images.txt":  # has names
+        if path.name == "images.txt":  # names of photographs may have commas; its numbers are checked below
             continue
         data = re.sub(rb"^\s*#.*", b"", content, flags=re.MULTILINE)
-        if bad := re.search(rb"\S*,\S*", data):  # COLMAP would read 27 for 27,25
+        if bad := re.search(rb"\S*,\S*", data):
             raise InputError(f"{path}: has {bad[0].decode(errors='replace')}; must have decimal points, not commas")
     for line, number, words in camera_lines(path := folder / "images.txt"):
         if wrong := [word for word in line.split()[:9] if not NUMBER.fullmatch(word)]:
             raise InputError(f"{path}: line {number - 1}: has {wrong[0].decode(errors='replace')}; must be a number")
-        if len(words) % 3 or not all(map(NUMBER.fullmatch, words[:30])):
+        if words is None or len(words) % 3 or not all(map(NUMBER.fullmatch, words[:30])):
             raise InputError(f"{path}: line {number}: must be the points of the camera in the line before; put an "
                              "empty line after each camera")  # fmt: skip

@@ -38,9 +38,11 @@ def write_scene(source: Source) -> list[Frame]:
     turn_masks(source, frames)
     require_frames(frames, source.src)
     for frame in frames:
+        if source.encoding != "auto":
+            frame.encoding = source.encoding
         if frame.pixels is None:
             read_as(frame.image, "image", require_whole)
-        if frame.pixels is None and "auto" == source.encoding == frame.encoding:
+        if frame.pixels is None and frame.encoding == "auto":
             read_as(frame.image, "image", encoding_of)  # refuses HDR curves and unknown profiles
     if mask := next((frame.mask for frame in frames if frame.mask not in (None, frame.image)), None):
         mask_values(pixels_of(mask), f"{mask}: mask")  # shows what is wrong with all
@@ -56,13 +58,12 @@ def write_scene(source: Source) -> list[Frame]:
     try:
         with contextlib.closing(Writer(source.scene)) as writer:
             for frame, name in zip(progress(frames, "converting", unit="photograph", disable=None), names):
-                encoding = source.encoding if source.encoding != "auto" else frame.encoding
-                files = write_frame(writer, frame, name, source.copy, encoding)
+                files = write_frame(writer, frame, name, source.copy)
                 if file := next((file for file in files if file and "$" in str(file)), None):
                     raise InputError(f"{file}: has a $ in its path, which scene files take for a parameter; rename it, "
                                      "or give --copy")  # fmt: skip
-                root.append(photograph_element(Shot(name, frame.camera, frame.light, files=files, encoding=encoding,
-                                                    saturation=frame.saturation)))  # fmt: skip
+                root.append(photograph_element(Shot(name, frame.camera, frame.light, files=files,
+                                                    encoding=frame.encoding, saturation=frame.saturation)))  # fmt: skip
             if truth := getattr(source, "truth", None):
                 writer.write("truth/mesh.ply", lambda file: shutil.copyfile(truth, file))
             writer.finish(scene_bytes(root))
@@ -77,9 +78,7 @@ def note_saturation(source: Source, frames: Sequence[Frame]) -> None:
     Raises InputError if their values are not linear: their curve is for 16 bits.
     """
     stored = [frame for frame in frames if frame.pixels is None and frame.saturation == 1]
-    found, note = saturations_of({
-        frame.image: source.encoding if source.encoding != "auto" else frame.encoding for frame in stored
-    })  # fmt: skip
+    found, note = saturations_of({frame.image: frame.encoding for frame in stored})
     for frame in stored:
         frame.saturation = found.get(frame.image, 1.0)
     if note:
@@ -110,12 +109,10 @@ def unread(source: Source) -> str:
     return f"files {', '.join(sorted(kinds))} there are not read; give {KINDS}" if kinds else ""
 
 
-def assumptions(source: Source, frames: Sequence[Frame]) -> list[str]:
+def assumptions(frames: Sequence[Frame]) -> list[str]:
     """Return clauses that tell the user what the scene file assumes: encoding, lens distortion and lights."""
-    given = [source.encoding if source.encoding != "auto" else frame.encoding for frame in frames]
-    files = [frame.image for frame, encoding in zip(frames, given) if encoding == "auto" and frame.pixels is None]
-    found = encodings(files)
-    found += [f"photographs are {what}, as said" for what in sorted({*given} - {"auto"})]
+    found = encodings([frame.image for frame in frames if frame.encoding == "auto" and frame.pixels is None])
+    found += [f"photographs are {what}, as said" for what in sorted({frame.encoding for frame in frames} - {"auto"})]
     curved = sum(not frame.lens.is_pinhole for frame in frames)
     found.append(f"distortion removed from {curved} photographs" if curved else "no lens distortion")
     lights = [frame.light for frame in frames]
@@ -158,5 +155,5 @@ def report(source: Source, frames: Sequence[Frame]) -> str:
     masked = sum(frame.mask is not None for frame in frames)
     lines.append(f"{len(frames)} photographs, {masked} with masks, of {len({f.pose.tobytes() for f in frames})} "
                  f"cameras: {source.scene}")  # fmt: skip
-    lines.append(f"Assumed: {'; '.join(assumptions(source, frames))}")
+    lines.append(f"Assumed: {'; '.join(assumptions(frames))}")
     return "\n".join(lines)

@@ -41,7 +41,7 @@ class Frame:
     fill_mask: bool = False  #: fill the holes in the mask
     said: str = ""  #: the path of the photograph in the other tool's file; empty if that names no photographs
     orientation: int = 1  #: EXIF orientation by which the file's pixels are to be turned
-    mask_orientation: int = 1  #: the same of the mask's file
+    mask_orientation: int = 1  #: EXIF orientation by which the mask's pixels are to be turned
 
     @property
     def camera(self) -> Camera:
@@ -186,19 +186,19 @@ def turn_masks(source: Source, frames: Sequence[Frame]) -> None:
     photographs it does not: then the masks of the others decide, if they agree, otherwise the mask's own EXIF data.
     """
     turned = [(f, f.mask) for f in frames if f.orientation > 1 and f.mask and f.mask != f.image]
+    # True: as the photograph is stored. False: upright.
     shown = {mask: image_size(mask) != frame.lens.size for frame, mask in turned
              if frame.orientation > 4 and frame.lens.size[0] != frame.lens.size[1]}  # fmt: skip
-    kinds, unknown = {*shown.values()}, 0
+    others, unknown = {*shown.values()}, 0
     for frame, mask in turned:
-        if mask in shown or len(kinds) == 1:
-            as_stored = shown.get(mask, kinds == {True})
-            frame.mask_orientation = frame.orientation if as_stored else 1
+        if mask in shown or len(others) == 1:
+            frame.mask_orientation = frame.orientation if shown.get(mask, True in others) else 1
         else:
             frame.mask_orientation = orientation_of(mask)
             unknown += frame.mask_orientation == 1
     if unknown:
-        source.notes.append(f"{unknown} masks of photographs that EXIF turns are taken to be upright: their sizes do "
-                            "not tell")  # fmt: skip
+        source.notes.append(f"{unknown} masks of photographs that EXIF turns are taken to be upright, because their "
+                            "sizes do not tell; turn them if they are not")  # fmt: skip
 
 
 def require_frames(frames: Sequence[Frame], source: Path) -> None:
@@ -230,7 +230,7 @@ def require_cameras(frames: Sequence[Frame]) -> None:
     for frame in frames:
         what = f"{frame.image}: camera"
         for file in (frame.image, frame.mask or frame.image):
-            command.require_utf8(str(file))
+            command.require_expressible_name(str(file))
         rotation = frame.pose[:3, :3]
         if not np.allclose(frame.pose[3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{what}: the last row of its pose is {frame.pose[3]}, must be 0 0 0 1; is it transposed?")

@@ -73,8 +73,8 @@ class Metashape(Photogrammetry):
         chunk = chunks[self.largest([[*own.iterfind("cameras//camera/transform")] for own in chunks], "chunks")]
         self.tell_unused(self.src, xml_names(chunk, self.fields.closed))
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
-        if len(sensors) < len(chunk.findall("sensors/sensor")):
-            raise InputError(f"{self.src}: sensor: two have the same id; each needs its own")
+        if repeated := [own for own in chunk.iterfind("sensors/sensor") if sensors[own.get("id")] is not own]:
+            raise InputError(f"{self.src}: sensor: two have the id {repeated[0].get('id')!r}; each needs its own")
         components = {component.get("id"): component for component in chunk.iterfind("components/component")}
         cameras = {camera.get("id"): camera for camera in chunk.iterfind("cameras//camera")}
         counts: Counter = Counter()

@@ -1,5 +1,6 @@
 """Base class of importers from photogrammetry: ordinary photographs with a light that is fixed to the camera."""
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ from mi_ring.importers.named_photographs import NamedPhotographs
 from mi_ring.importers.reading import read_as
 
 EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
-#: Tags of logarithms to base 2 (APEX), with their factors, for files that lack the value itself.
+#: By tag of a value: the tag of its logarithm to base 2 (APEX), and the factor to multiply this with. Some files have
+#: only the logarithm.
 LOGARITHMS: dict[int, tuple[int, float]] = {
     ExifTags.Base.ExposureTime: (ExifTags.Base.ShutterSpeedValue, -1.0),
     ExifTags.Base.FNumber: (ExifTags.Base.ApertureValue, 0.5),
@@ -59,14 +61,15 @@ class Photogrammetry(NamedPhotographs):
             return ones
         if np.isnan(known).any():
             path = frames[int(np.isnan(known).argmax())].image
-            values = ", ".join(str(value) for value in exif_values(path).values()) or "missing"
+            own = exif_values(path)
+            values = ", ".join(str(own.get(tag, "missing")) for tag in EXPOSURE)
             raise InputError(f"{path}: EXIF: exposure time, ISO and aperture are {values}; other photographs have "
                              "more; add them, or give --no-exif if all have the same exposure")  # fmt: skip
         return np.divide(known, np.median(known))
 
 
 def exif_values(path: Path) -> dict[int, Any]:
-    """Read exposure time [s], ISO and aperture from the EXIF data of an image file. Returns values by EXIF tag.
+    """Read exposure time [s], ISO, aperture and logarithms of these from an image file. Returns values by EXIF tag.
 
     Values that the file lacks are left out.
     """
@@ -91,17 +94,15 @@ def exposures_of(photographs: Sequence[Mapping[int, Any]]) -> list[float]:
 
 
 def exposure_value(exif: Mapping[int, Any], tag: int) -> float:
-    """Return exposure time [s], ISO or aperture, by its EXIF tag; NaN if it is unknown.
+    """Return exposure time [s], ISO or aperture by its EXIF tag; NaN if it is unknown.
 
-    `exif`: EXIF values by tag. Time and aperture may also be known by their logarithm.
+    `exif`: EXIF values by tag. If time or aperture is missing or invalid, it is computed from its logarithm.
     """
     value = positive(exif.get(tag))
     if math.isnan(value) and tag in LOGARITHMS:
-        other, factor = LOGARITHMS[tag]
-        try:
-            return positive(2.0 ** (factor * float(exif[other])))
-        except (KeyError, TypeError, ValueError, ArithmeticError):
-            pass
+        logarithm, factor = LOGARITHMS[tag]
+        with contextlib.suppress(KeyError, TypeError, ValueError, ArithmeticError):
+            value = positive(2.0 ** (factor * float(exif[logarithm])))
     return value
 
 

@@ -87,20 +87,9 @@ class SfmData(Photogrammetry):
         for k, view in enumerate(top["views"]):
             what = f"{self.src}: views[{k}]"
             file = file_name(require_object(view, what), "path", what)
-            own = poses.get(str(view.get("poseId", view.get("viewId"))))
-            if own is None:
+            if (pose := view_pose(poses, rigs, view, what)) is None:
                 self.without_pose.add(PureWindowsPath(file).name)
                 continue
-            place = require_object(own.get("pose"), f"{what}: pose")
-            if str(place.get("rotationOnly")).lower() in ("true", "1"):
-                self.without_pose.add(PureWindowsPath(file).name)
-                continue
-            pose = alicevision_pose(place.get("transform"), f"{what}: pose")
-            if str(view.get("isPoseIndependant", True)).lower() in ("false", "0"):  # the pose is that of the rig
-                if (in_rig := rig_pose(rigs, view, what)) is None:
-                    self.without_pose.add(PureWindowsPath(file).name)
-                    continue
-                pose = pose @ in_rig
             key = str(view.get("intrinsicId"))
             intrinsic = require_object(intrinsics.get(key), f"{what}: intrinsics {key!r}")
             lens = alicevision_lens(intrinsic, version, f"{self.src}: intrinsic {key!r}")
@@ -186,6 +175,25 @@ def type_number(value: dict, path: Path) -> int:
     InputError if there is no number.
     """
     return int(matrix(value.get("polymorphic_id"), (), f"{path}: intrinsics: polymorphic_id")) & 0x7FFFFFFF
+
+
+def view_pose(poses: dict[str, Any], rigs: dict[str, Any], view: dict, what: str) -> np.ndarray | None:
+    """Return the camera-to-world pose (4, 4) of a photograph; None if AliceVision has not found it.
+
+    `poses`, `rigs`: JSON objects by number. `view`: JSON object of the photograph. Raises InputError if they are
+    invalid. The message begins with `what`.
+    """
+    own = poses.get(str(view.get("poseId", view.get("viewId"))))
+    if own is None:
+        return None
+    place = require_object(own.get("pose"), f"{what}: pose")
+    if str(place.get("rotationOnly")).lower() in ("true", "1"):
+        return None
+    pose = alicevision_pose(place.get("transform"), f"{what}: pose")
+    if str(view.get("isPoseIndependant", True)).lower() not in ("false", "0"):
+        return pose
+    in_rig = rig_pose(rigs, view, what)  # `pose` is that of the rig
+    return None if in_rig is None else pose @ in_rig
 
 
 def alicevision_pose(transform: Any, what: str) -> np.ndarray:

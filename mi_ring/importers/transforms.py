@@ -130,7 +130,7 @@ def transforms_camera(given: dict, image: Path, where: str) -> Lens:
             raise InputError(f"{where}.{name}: is {value}; must be between 0 and pi")
         return value
 
-    said = [name for name in ("w", "h") if given.get(name) is not None]
+    said = any(given.get(name) is not None for name in ("w", "h"))
     size: Any = (number("w"), number("h")) if said else image_size(image)  # Lens truncates
     width, height = size
     for name in given:

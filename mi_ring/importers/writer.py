@@ -14,12 +14,11 @@ import scipy.ndimage
 
 from mi_ring.capture.decoding import is_linear
 from mi_ring.errors import InputError
-from mi_ring.image_headers import bits_of
 from mi_ring.images import mask_values, oriented, write_image
 from mi_ring.importers.frames import Frame
-from mi_ring.importers.reading import pixels_of
+from mi_ring.importers.reading import bits_of, pixels_of
 from mi_ring.importers.undistortion import undistort
-from mi_ring.scene.shot import Encoding, Files
+from mi_ring.scene.shot import Files
 from mi_ring.system.files import relative_to, write_file
 
 
@@ -86,14 +85,14 @@ class Writer:
                 folder.rmdir()
 
 
-def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: Encoding) -> Files:
+def write_frame(writer: Writer, frame: Frame, name: str, copy: bool) -> Files:
     """Write the files of a photograph that must change: image, mask and valid pixels. Returns the paths for the scene.
 
     Pixels change if the lens has distortion, if the photograph must be turned, or if the scene file cannot express the
-    `encoding`. `name`: name of the new files without suffix. `copy`: True: also copy files that need not change; False:
+    encoding. `name`: name of the new files without suffix. `copy`: True: also copy files that need not change; False:
     the scene refers to the originals.
     """
-    straight, pixels, turn = frame.lens.is_pinhole, frame.pixels, frame.orientation
+    straight, pixels, turn, encoding = frame.lens.is_pinhole, frame.pixels, frame.orientation, frame.encoding
 
     def place(folder: str, key: Hashable, path: Path, changed: Callable[[], np.ndarray | None]) -> Path:
         if (folder, key) not in writer.shared:
@@ -128,4 +127,4 @@ def write_frame(writer: Writer, frame: Frame, name: str, copy: bool, encoding: E
             mask = np.uint8(255) * scipy.ndimage.binary_fill_holes(mask[..., 0] > 127)[..., None]
         return mask if straight else undistort(mask, frame.lens, saturation=np.inf)[0]
 
-    return Files(image, place("masks", (file, frame.lens), file, mask), valid)
+    return Files(image, place("masks", (file, frame.lens, frame.mask_orientation), file, mask), valid)

@@ -32,7 +32,7 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
     def shares(hull: Hull) -> np.ndarray:
         return (hull.shortfall(silhouettes, pixels) < 1).mean(1)
 
-    agree, why, turned = shares(capture.hull), None, list[str]()
+    agree, why, turned = shares(capture.hull), None, []
     if capture.whole and agree.min() < CONFORMS:
         whole = [silhouette.whole for silhouette in subsample(silhouettes, 32, 96)]
         why = mistake(whole) if np.median(agree) < CONFORMS else None
@@ -54,9 +54,9 @@ def agreements(capture: Capture) -> tuple[dict[str, float], list[str]]:
 
 
 def turns(silhouette: Silhouette, hull: Hull) -> list[str]:
-    """List the angles by which the mask of a photograph may be turned: turned back, it agrees with the hull of all.
+    """Return sentences for the user: by which angles the mask of a photograph may be turned. It is empty if by none.
 
-    Returns sentences for the user. Angles of 90 and 270 degrees are tried if the mask is square.
+    Turned back by such an angle, the mask agrees with the `hull` of all. 90 and 270 degrees are tried if it is square.
     """
     mask = silhouette.whole.mask
     quarters = (1, 2, 3) if mask.shape[0] == mask.shape[1] else (2,)

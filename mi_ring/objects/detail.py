@@ -22,7 +22,7 @@ from mi_ring.system.machine import release_memory
 CORNERS = torch.tensor(list(itertools.product((0, 1), repeat=3)))  #: (8, 3) of a cube
 AT_ONCE = 2**16  #: points whose weights are computed at once
 MOST = 2**20  #: coordinates of cubes are from -`MOST` to `MOST` - 1
-PLACES = torch.tensor([2**42, 2**21, 1])  #: a key is the scalar product of these and of a corner's coordinates
+PLACES = torch.tensor([2**42, 2**21, 1])  #: a key is the scalar product of these and of coordinates from -`MOST`
 
 
 class Grid(nn.Module):
@@ -82,7 +82,7 @@ class Grid(nn.Module):
             weight, node = (torch.cat(part).numpy().ravel() for part in zip(*parts))
             found.append(scipy.sparse.csr_matrix((weight, node, rows), (len(s), len(self.keys(k)))))
         self.latest.append((s.detach(), found))
-        release_memory()  # intermediate results take more than the weights
+        release_memory()  # of intermediate results, which take more than the weights
         return found
 
     def share(self, other: "Grid") -> None:
@@ -126,7 +126,7 @@ def same(a: Tensor, b: Tensor) -> bool:
 
 
 def keys_of(cubes: Tensor) -> Tensor:
-    """Pack the coordinates (..., 3) of cubes, whole numbers, into one integer each, (...), in lexicographic order."""
+    """Pack coordinates (..., 3) of cubes, whole numbers, into one integer each, (...), in lexicographic order."""
     return (cubes.clamp(-MOST, MOST - 1) + MOST).long() @ PLACES
 
 
@@ -174,7 +174,8 @@ class DetailedFlow(Flow):
     def of(cls, flow: Flow, grid: Grid, points: Tensor, normals: Tensor) -> "DetailedFlow":
         """Add a displacement to `flow`, which is frozen.
 
-        The displacement is along the `normals` (V, 3) of the surface at domain `points` (V, 3).
+        The displacement is along the `normals` (V, 3) of the surface at domain `points` (V, 3). Longer normals have
+        more weight in the mean direction of a corner.
         """
         detailed = cls(architecture_of(flow), grid.arguments())
         detailed.base, detailed.grid = Remembered(flow), grid

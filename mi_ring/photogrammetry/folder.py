@@ -256,7 +256,7 @@ def find_pictures(folder: Path, upright: bool = True) -> list[Picture]:
         kind = path.suffix.lower()
         if kind not in SUFFIXES or path.name.startswith(".") or not path.is_file():
             continue
-        command.require_utf8(str(path))
+        command.require_expressible_name(str(path))
         if "$" in path.name:
             raise InputError(f"{path}: FOLDER: has a $ in its name, which scene files take for a parameter; rename it")
         if path.stem in found and not {kind, found[path.stem].suffix.lower()} & {*RAW, *HEIF}:

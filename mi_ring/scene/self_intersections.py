@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 
-from mi_ring.scene.alignment import to_flat
+from mi_ring.scene.alignment import to_flat, to_vectors
 from mi_ring.scene.plain_mesh import scene_of
 
 HIT_OFFSET = 1e-6  #: step of a ray past a hit, for a mesh of size 1: more than float32's rounding error
@@ -30,8 +30,7 @@ def crossing_triangles(vertices, faces) -> np.ndarray:
     lanes = np.flatnonzero(length > 0)
     while len(lanes):
         start = origin[lanes] + along[lanes] * reached[lanes, None]
-        begin, toward = ([to_flat(mi.Float, part) for part in a.T] for a in (start, along[lanes]))
-        ray = mi.Ray3f(mi.Point3f(*begin), mi.Vector3f(*toward))
+        ray = mi.Ray3f(mi.Point3f(to_vectors(start)), to_vectors(along[lanes]))
         ray.maxt = to_flat(mi.Float, (length - reached)[lanes])
         hit = scene.ray_intersect_preliminary(ray)
         valid, t, triangle = (np.array(a) for a in (hit.is_valid(), hit.t, hit.prim_index))

@@ -9,7 +9,7 @@ import torch
 
 from mi_ring.geometry.camera import Camera
 from mi_ring.geometry.meshes import area_vectors
-from mi_ring.scene.alignment import to_flat
+from mi_ring.scene.alignment import to_flat, to_vectors
 from mi_ring.scene.assembly import RenderedObject
 from mi_ring.scene.plain_mesh import mesh_of
 
@@ -65,10 +65,7 @@ class Visibility:
                 continue
             along = (view.camera.position - self.center) / self.size - start[lanes]
             distance = np.linalg.norm(along, axis=1, keepdims=True)
-            origin, direction = (
-                mi.Vector3f(*(to_flat(mi.Float, part) for part in a.T)) for a in (start[lanes], along / distance)
-            )
-            ray = mi.Ray3f(mi.Point3f(origin), direction)
+            ray = mi.Ray3f(mi.Point3f(to_vectors(start[lanes])), to_vectors(along / distance))
             ray.maxt = to_flat(mi.Float, distance)
             seen[lanes] = ~np.array(self.scene.ray_test(ray))
         return seen

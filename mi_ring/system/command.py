@@ -27,6 +27,7 @@ MAX_MESSAGE = 800  #: characters of an error message
 #: Signals that end a command: Ctrl-C; `kill` and schedulers; a terminal that closes (not on Windows).
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  #: of a full disk, a quota, and `ulimit -f`
+CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")  #: characters that XML cannot express
 REPEATED = 5.0  #: a second SIGTERM or SIGHUP within this time is a copy of the first [s]
 
 
@@ -44,7 +45,7 @@ def parse(
     if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # set by the import of mi_ring
         signal.signal(signal.SIGINT, receive)  # from here on, there may be partial files to remove
     for word in (*arguments, os.getcwd()):
-        require_utf8(word)
+        require_expressible_name(word)
     words, box = ["--help" if word == "--help-all" else word for word in arguments], io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
@@ -58,10 +59,7 @@ def parse(
     return config
 
 
-CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")  #: characters that XML cannot express
-
-
-def require_utf8(name: str) -> None:
+def require_expressible_name(name: str) -> None:
     """Raise InputError if a file name is not UTF-8, or if it has a character that XML cannot express.
 
     The file system itself allows any bytes.
