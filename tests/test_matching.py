@@ -157,6 +157,22 @@ def test_what_an_earlier_run_has_found_is_kept(folder, monkeypatch):
     assert content(database) == (cameras, verified)
 
 
+def test_pairs_that_were_not_chosen_are_matched_for_a_photograph_without_a_camera(folder, monkeypatch):
+    """Of one photograph alone, and then by guided matching, which finds no fewer."""
+    pictures, work = find_pictures(folder), folder / "work"
+    files = [matching.grey_file(picture) for picture in pictures]
+    monkeypatch.setattr(matching, "pairs_to_match", lambda descriptors: [(0, 1), (1, 2), (4, 5)])
+    matching.find_features(pictures, work, silent)
+    matching.match_features(pictures, work, silent)
+    _, before = content(work / "database.db")
+    assert matching.match_again({files[7]}, work, silent)
+    _, after = content(work / "database.db")
+    new = {frozenset((file, files[7])) for file in files[:7]}
+    assert len(before) == 3 and set(after) == set(before) | new
+    assert all(after[pair] == found for pair, found in before.items())
+    assert all(len(after[pair]) > 40 for pair in new if files[3] not in pair)
+
+
 def two_views(random, plane):
     """Points of a scene, or of a plane, in two photographs (n, 2), by the same camera."""
     camera = matching.pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 900, 800, 600)

@@ -257,13 +257,16 @@ def match_pairs(
 
 
 def match_again(files: Collection[str], folder: Path, progress: Progress) -> bool:
-    """Match pairs of images again by guided matching. Returns True if there was such a pair.
+    """Match each pair that contains one of `files`, names of grey images, as well as possible.
 
-    The pairs are those that have matches and contain one of `files`, names of grey images. Guided matching searches
-    along the epipolar lines. It finds more matches, but also more wrong ones. The COLMAP database `folder`/database.db
-    is changed.
+    First, pairs that were not chosen for matching are matched. Then those with matches are matched again by guided
+    matching. It searches along the epipolar lines, and finds more matches, but also more wrong ones. The COLMAP
+    database `folder`/database.db is changed. Returns True if a pair has matches.
     """
     database = folder / "database.db"
+    features = read_features(database)
+    asked = [(a, b) for a, b in itertools.combinations(sorted(features), 2) if a in files or b in files]
+    list(progress(match_pairs(asked, features, folder), "matching more", len(asked)))
     pairs = [(a.name, b.name) for a, b, first, _ in read_matches(database)
              if len(first) and (a.name in files or b.name in files)]  # fmt: skip
     for batch in progress(list(batches(pairs, BATCH)), "matching again"):
