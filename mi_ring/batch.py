@@ -37,7 +37,7 @@ class BatchConfig:
     """Mitsuba XML files. Each names the photographs of one object, for example captures/*/scene.xml."""
     out: Path = Path("out")
     """Folder for all results. Each scene gets a folder of its name, and index.html shows all results.
-    Its folder batch has the printed output of each fit.
+    OUT/batch has what each fit printed.
     On a cluster, the scenes and this folder must have the same path on all machines."""
     workers: int = 1
     """Number of fits that run at the same time, for example 2. More fits use the cores better, but need more memory."""
@@ -50,8 +50,8 @@ class BatchConfig:
     """Memory that one fit needs [GiB], for example 4. 0: no limit.
     A machine then runs only as many fits at a time as its memory allows."""
     retries: int = 3
-    """How often a fit is restarted after its process has died, 0 or more. Only restarts without progress count.
-    If the process dies once more, the fit has failed. A restarted fit continues from its checkpoint.
+    """Largest number of restarts of a fit whose process has died, 0 or more. A restarted fit continues from its
+    checkpoint. If it reaches a new checkpoint, the count begins again at 0.
     Raise the number if other programs often stop the fits."""
     address: str | None = None
     """Address of a Ray cluster, for example auto or 10.0.0.1:6379. Without this option: this machine alone."""

@@ -55,9 +55,8 @@ class NamedPhotographs(Source):
 
     @property
     def folder(self) -> Path:
-        """Folder of the photographs: that of --images, or a folder images near the camera file.
-
-        Without both, it is the folder of the camera file.
+        """Folder of the photographs: the one of --images. Without it: a folder `images`, beside the camera file or one
+        level above. Without both: the folder of the camera file.
         """
         candidates = (self.beside / "images", self.beside.parent / "images")
         return self.images or next((folder for folder in candidates if folder.is_dir()), self.beside)

@@ -144,7 +144,10 @@ class Remembered(nn.Module):
         self.last: tuple[Tensor, tuple[float, ...], Tensor] | None = None  #: points, further arguments, result
 
     def forward(self, s: Tensor, *more: float) -> Tensor:
-        """Call the method with points (V, 3) and further arguments."""
+        """Return what the network's method returns for points (V, 3) and further arguments.
+
+        If they are those of the last call, this is the result of the last call.
+        """
         last = self.last
         if last is None or not same(last[0], s) or last[1] != more:
             with torch.no_grad(), torch.autocast(s.device.type, enabled=False):

@@ -46,7 +46,7 @@ class RenderConfig(MaterialOptions):
     """Mitsuba XML file with the cameras and lights to render. The image files that it names need not exist."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """Folder for the pictures, or a file FILE.mp4 for a film.
-    A picture is linear if the scene names an EXR file, and 8-bit sRGB if the scene names PNG or JPEG."""
+    Each picture has the file name of its photograph in the scene: linear for .exr, 8-bit sRGB for .png and .jpg."""
     turntable: int = 0
     """Render a film with this number of pictures, for example 120: camera and light move once around the object.
     0: no such film."""

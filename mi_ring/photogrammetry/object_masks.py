@@ -146,10 +146,11 @@ def kept_masks(pictures: Sequence[Picture], folder: Path) -> dict[str, np.ndarra
 def given_masks(
     pictures: Sequence[Picture], sparse: SparseModel, grid: VoxelGrid, known: SegmentationInput, progress: Progress
 ) -> tuple[VoxelObject, dict[str, np.ndarray]]:
-    """Read the user's masks, and find the object by them. Returns (object, masks by the photograph's name).
+    """Read the user's masks, and find the object by them.
 
-    `pictures`: photographs with a camera in `sparse`. `grid`: voxels to search. `known`: source of the masks, and the
-    box. Raises InputError if there are too few masks, or if they disagree.
+    Returns (object, dict from the photograph's name to its mask). A mask is reduced and without distortion: (h, w)
+    uint8, 0 or `OBJECT`. `pictures`: photographs with a camera in `sparse`. `grid`: voxels to search. `known`: where
+    the masks are, and the box around the object, which the user gave. Raises InputError if there are too few masks, or if they disagree.
     """
     masks = {}
     for picture in progress(pictures, "masks"):

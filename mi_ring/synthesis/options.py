@@ -84,8 +84,8 @@ class SynthesizeConfig:
     lamp: a point light that is in the same place for all photographs."""
     lamps: int = 1
     """Number of lamps that shine in all photographs, 1 to 8. Only with --light lamp.
-    Give 2 or more to test fits with --light lamps or --refine lamps. In the scene file, the first lamp is the light in
-    each <sensor>, and the other lamps are emitters outside <sensor>."""
+    Give 2 or more to test the command fit with --light lamps or --refine lamps.
+    In the scene file, the first lamp is the light in each <sensor>. The others are emitters outside <sensor>."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the flash relative to the lens: left, up and forward [distance from the camera to the object].
     0.1 0.2 0: to the left by a tenth of this distance and up by a fifth of it. Only for --light flash."""
