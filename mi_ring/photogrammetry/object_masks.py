@@ -150,7 +150,8 @@ def given_masks(
 
     Returns (object, dict from the photograph's name to its mask). A mask is reduced and without distortion: (h, w)
     uint8, 0 or `OBJECT`. `pictures`: photographs with a camera in `sparse`. `grid`: voxels to search. `known`: where
-    the masks are, and the box around the object, which the user gave. Raises InputError if there are too few masks, or if they disagree.
+    the masks are, and the box around the object, which the user gave. Raises InputError if there are too few masks, or
+    if they disagree.
     """
     masks = {}
     for picture in progress(pictures, "masks"):
