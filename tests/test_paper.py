@@ -44,10 +44,7 @@ from mi_ring.system import machine
 
 ALBEDO = np.array([0.7, 0.4, 0.25])  #: of a ball seen from one side
 NO_DATA = datasets.Dataset("none", Path("none.xml"), Path("none"))
-TINY = {
-    "iterations": 2, "levels": (1,), "widths": (32,), "shares": (1.0,), "subdivisions": 2, "domain": "sphere",
-    "indirect": False,
-}  # fmt: skip
+TINY = {"iterations": 2, "levels": (1,), "widths": (32,), "shares": (1.0,), "subdivisions": 2, "domain": "sphere"}
 
 
 @pytest.fixture(scope="module")
