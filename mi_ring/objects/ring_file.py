@@ -119,9 +119,9 @@ def require_valid(ring: FittedObject) -> None:
     require(closed, "the domain is no closed surface")
     for grid in [part for part in ring.modules() if isinstance(part, detail.Grid)]:
         require(all(bool((grid.keys(k).diff() > 0).all()) for k in range(len(grid.cells))), "details are not in order")
-        octave = min(1, len(grid.cells) - 1)  # the coarsest may fill the domain, the finest misses some vertices
-        inside = grid.octave_weights(torch.from_numpy(points), octave)[0].sum(1) > 0.5
-        require(bool(inside.float().mean() > 0.5), "details are elsewhere than the domain")
+        for k in range(len(grid.cells))[:2]:  # the coarsest may fill the domain, the finest may miss some vertices
+            inside = grid.octave_weights(torch.from_numpy(points), k)[0].sum(1) > 0.5
+            require(bool(inside.float().mean() > 0.5), "details are elsewhere than the domain")
     for name, value in ring.named_buffers():
         if re.search(r"\.?directions\d+$", name):
             require(bool((value.norm(dim=1) < 1.01).all()), f"{name} are longer than 1")
