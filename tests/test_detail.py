@@ -9,10 +9,11 @@ import torch
 import trimesh
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.errors import InputError
 from mi_ring.fitting import agreeing_adam
 from mi_ring.fitting.agreeing_adam import AgreeingAdam
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.detail_stage import add_detail, detail_levels, unfold
+from mi_ring.fitting.detail_stage import add_detail, detail_levels, share_weights, unfold
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.optimisation import detail_steppers
 from mi_ring.fitting.schedule import Schedule
@@ -146,6 +147,59 @@ def test_a_file_holds_details():
     assert all(len(values.unique()) < 2**16 for values in rounded.shape_net.grid.values)
     worst = (ring.surface(s) - rounded.surface(s)).norm(dim=1).max()
     assert 0 < worst < 2e-3 * ring.shape_net.grid.cells[0] * float(ring.radius)
+
+
+def of_all(**changed):
+    return lambda state: [state[name]["arguments"]["grid"].update(changed) for name in ("shape_net", "brdf_net")]
+
+
+def of_tensor(name, change):
+    return lambda state: state["networks"].update({name: change(state["networks"][name])})
+
+
+def two_channels(state):
+    state["brdf_net"]["arguments"]["net"]["arguments"]["parameters"] = [
+        ("diffuse", 2, 0.0, math.inf, 0.0), ("specular", 2, 0.0, math.inf, 0.0), ("roughness", 1, 0.0, 1.0, 0.0)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (of_tensor("shape_net.grid.keys3", lambda keys: keys.flip(0)), "not in order"),
+        (of_tensor("brdf_net.grid.keys3", lambda keys: keys[:1].expand(len(keys))), "not in order"),
+        (of_tensor("shape_net.grid.keys0", lambda keys: keys + 2**30), "elsewhere"),
+        (of_tensor("shape_net.grid.keys3", torch.Tensor.float), "another kind"),
+        (of_tensor("shape_net.grid.values.3", torch.Tensor.int), "another kind"),
+        (of_tensor("shape_net.directions3", lambda directions: 2 * directions), "longer than 1"),
+        *[(of_all(cell=cell), "positive") for cell in (0.0, -0.1, math.nan, math.inf, 1e308)],
+        *[(of_all(cell=cell), "elsewhere") for cell in (1e30, 1e-30, 1.0)],
+        *[(of_all(nodes=nodes), "sizes") for nodes in ([10**9] * 4, [1] * 2000, [])],
+        (of_all(channels=10**9), "sizes"),
+        (two_channels, "2 channels"),
+    ],
+)
+def test_damaged_details_are_refused(damage, message):
+    ring = small()
+    add_detail(ring, 4, 20)
+    state = compact(ring_state(ring))
+    ring_of(state)
+    damage(state)
+    with pytest.raises(ValueError, match=message):
+        ring_of(state)
+
+
+def test_materials_with_other_details_keep_their_own_weights():
+    shape, material, s = small(), small(), points_near()
+    add_detail(shape, 4, 20)
+    add_detail(material, 4, 33)
+    for values in material.brdf_net.grid.values:
+        values.data = torch.randn(values.shape, generator=torch.Generator().manual_seed(5))
+    expected = material.material(s)
+    shape.brdf_net = material.brdf_net
+    share_weights(shape)
+    shape.surface(s)
+    assert all(torch.equal(value, expected[name]) for name, value in shape.material(s.clone()).items())
 
 
 @pytest.mark.parametrize("resolution", [10, 55, 220])
@@ -317,6 +371,12 @@ def test_one_of_the_two(kind, small_capture):
     fit.run()
     shape, texture = (any(v.any() for v in net.grid.values) for net in (fit.ring.shape_net, fit.ring.brdf_net))
     assert (shape, texture) == (kind == "shape", kind == "texture")
+
+
+def test_networks_with_details_are_refused(detailed, small_capture):
+    ring = detailed[0].ring
+    with pytest.raises(InputError, match="networks: have details"):
+        Fit(load_capture(small_capture), SMALL, networks=(ring.shape_net, ring.brdf_net))
 
 
 def test_details_that_do_not_help_are_removed(small_capture):

@@ -23,6 +23,7 @@ from mi_ring.geometry.meshes import genus, load_closed_mesh
 from mi_ring.nets.brdf_net import BRDFNet, MaterialNet
 from mi_ring.nets.resnet import shape_net_of
 from mi_ring.nets.shape_net import Flow
+from mi_ring.objects.detail import DetailedFlow, DetailedMaterial
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_of
 from mi_ring.scene.assembly import has_table, lamps_of
@@ -111,6 +112,8 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
         for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
             if not hasattr(network, needed):
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
+        if isinstance(networks[0], DetailedFlow) or isinstance(networks[1], DetailedMaterial):
+            raise InputError("networks: have details, which a fit adds itself; give their base.network instead")
         networks[1].set_parameters(parameters, scale)
     else:
         networks = (shape_net_of(config.shape_net, config.steps, config.encoding, config.frequencies),

@@ -5,6 +5,7 @@ only cubes that the domain passes have values.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,11 +30,13 @@ class Grid(nn.Module):
     """A function of points in ℝ³: a sum of octaves, from coarse to fine. Each is trilinear on cubes.
 
     `cell`: side of the finest cubes; those of each coarser octave are twice as large. `nodes`: number of corners that
-    have values, for each octave. `channels`: of the values, initially 0.
+    have values, for each octave. `channels`: of the values, initially 0. Raises ValueError for a wrong `cell`.
     """
 
     def __init__(self, cell: float, nodes: Sequence[int], channels: int) -> None:
         super().__init__()
+        if not 0 < cell * 2.0 ** len(nodes) < math.inf:
+            raise ValueError(f"cell: is {cell}, must be a positive number")
         self.cells = [cell * 2**k for k in reversed(range(len(nodes)))]
         for k, n in enumerate(nodes):
             self.register_buffer(f"keys{k}", torch.zeros(n, dtype=torch.long))
@@ -86,8 +89,9 @@ class Grid(nn.Module):
         return found
 
     def share(self, other: "Grid") -> None:
-        """Use the same memory for weights as `other`, a grid with the same corners."""
-        self.latest = other.latest
+        """Use the same memory for weights as `other`, if it has the same corners."""
+        if self.cells == other.cells and all(torch.equal(self.keys(k), other.keys(k)) for k in range(len(self.cells))):
+            self.latest = other.latest
 
     def octave_weights(self, s: Tensor, octave: int) -> tuple[Tensor, Tensor]:
         """Compute the weights (V, 8) of the corners around points (V, 3), and their places (V, 8) among the values."""

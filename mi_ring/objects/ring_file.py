@@ -14,7 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.nets import resnet  # noqa: F401  (registers it)
 from mi_ring.nets.registry import architecture_of, build
-from mi_ring.objects import detail  # noqa: F401  (registers its networks)
+from mi_ring.objects import detail
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.files import is_sealed
 from mi_ring.version import __version__
@@ -60,7 +60,10 @@ def ring_of(state: dict) -> FittedObject:
         refuse("solver", arguments.pop("solver", "euler"), "euler")
         shape_net = {**shape_net, "arguments": arguments}
     domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
-    for parameter in state["brdf_net"]["arguments"].get("parameters", ()):
+    for name in ("shape_net", "brdf_net"):
+        require_grid(state["networks"], name, state[name])
+    material = state["brdf_net"]["arguments"].get("net", state["brdf_net"])  # without details
+    for parameter in material["arguments"].get("parameters", ()):
         require(parameter[1] in (1, 3), f"{parameter[0]} has {parameter[1]} channels")
     ring = FittedObject(
         torch.zeros(3), 1.0, domain=domain, bsdf=state["bsdf"], indirect=state["indirect"],
@@ -68,6 +71,9 @@ def ring_of(state: dict) -> FittedObject:
         ground=state["networks"].get("ground"), up=state.get("up"), metres=state.get("metres"),
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
+    for name, value in [*ring.named_parameters(), *ring.named_buffers()]:
+        found = state["networks"].get(name, value)  # without a buffer that is not saved
+        require(found.is_floating_point() == value.is_floating_point(), f"{name} has numbers of another kind")
     require_valid(ring)
     return ring
 
@@ -80,6 +86,18 @@ def refuse(name: str, found: object, supported: str) -> None:
     if found != supported:
         raise InputError(f"{name}: is {found}, only {supported} is supported; fit again, or use the version of mi_ring "
                          "that wrote this file")  # fmt: skip
+
+
+def require_grid(networks: dict, name: str, architecture: dict) -> None:
+    """Raise ValueError if details have other sizes than their file says. Memory for wrong sizes is not allocated.
+
+    `networks`: tensors of the file by name. `name`: "shape_net" or "brdf_net". `architecture`: its description.
+    """
+    if architecture["name"] in ("detailed-flow", "detailed-material"):
+        grid, start = architecture["arguments"]["grid"], f"{name}.grid."
+        nodes = [len(value) for key, value in networks.items() if key.startswith(f"{start}keys")]
+        found = nodes, networks[f"{start}values.0"].shape[1]
+        require(found == (grid["nodes"], grid["channels"]), f"the details of {name} have other sizes than it says")
 
 
 def require_valid(ring: FittedObject) -> None:
@@ -99,6 +117,14 @@ def require_valid(ring: FittedObject) -> None:
     require(len(faces) > 0 and faces.min() >= 0 and faces.max() < len(points), "the domain lacks vertices")
     closed = trimesh.Trimesh(points, faces, process=False, validate=False).is_watertight
     require(closed, "the domain is no closed surface")
+    for grid in [part for part in ring.modules() if isinstance(part, detail.Grid)]:
+        require(all(bool((grid.keys(k).diff() > 0).all()) for k in range(len(grid.cells))), "details are not in order")
+        for k in range(len(grid.cells))[:2]:  # the coarsest may fill the domain, the finest may miss some vertices
+            inside = grid.octave_weights(torch.from_numpy(points), k)[0].sum(1) > 0.5
+            require(bool(inside.float().mean() > 0.5), "details are elsewhere than the domain")
+    for name, value in ring.named_buffers():
+        if re.search(r"\.?directions\d+$", name):
+            require(bool((value.norm(dim=1) < 1.01).all()), f"{name} are longer than 1")
 
 
 def require(condition: bool, otherwise: str) -> None:
