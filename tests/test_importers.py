@@ -27,6 +27,7 @@ from helpers.photogrammetry_files import (
     cameras,
     capturing_reality,
     csv_table,
+    edited,
     llff,
     metashape,
     middlebury,
@@ -397,11 +398,7 @@ def refused(arguments, pattern, folder):
     ("<rotation locked='0'>", "<rotation locked='0'>1 ", r"rotation: is of shape \(10,\)"),
 ])  # fmt: skip
 def test_mistakes_in_metashape(tmp_path, old, new, pattern):
-    path = metashape(tmp_path)
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
-    refused(["metashape", path], pattern, tmp_path)
+    refused(["metashape", edited(metashape(tmp_path), old, new)], pattern, tmp_path)
 
 
 def test_a_little_shear_does_not_matter(tmp_path):
@@ -540,11 +537,7 @@ def test_mistakes_in_meshrooms_intrinsics(tmp_path, own, pattern):
     ('"center": ["-0.3"', '"center": ["far"', r"views\[0\]: subPoses\[1\].pose.center: is .*far"),
 ])  # fmt: skip
 def test_mistakes_in_meshrooms_rigs(tmp_path, old, new, pattern):
-    path = meshroom_rig(tmp_path)
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
-    refused(["sfmdata", path], pattern, tmp_path)
+    refused(["sfmdata", edited(meshroom_rig(tmp_path), old, new, 1)], pattern, tmp_path)
 
 
 def leaves(value, path=()):

@@ -8,7 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.foreign_captures import K, cameras, colmap_folder, converted, noise, transforms, write
-from helpers.photogrammetry_files import NAMES, POINTS, SIZE, alicevision, csv_table, metashape, middlebury, openmvg
+from helpers.photogrammetry_files import (
+    NAMES,
+    POINTS,
+    SIZE,
+    alicevision,
+    csv_table,
+    edited,
+    metashape,
+    middlebury,
+    openmvg,
+)
 from PIL import Image
 
 from mi_ring import convert
@@ -67,11 +77,8 @@ def in_folders(folder, wrap=lambda name: name):
 
 
 def replaced(path, pairs):
-    text = path.read_text()
     for old, new in pairs.items():
-        assert old in text
-        text = text.replace(old, new)
-    path.write_text(text)
+        edited(path, old, new)
 
 
 def metashape_in_folders(folder):

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import foreign_captures, photogrammetry_files, structure_files
-from helpers.photogrammetry_files import NAMES
+from helpers.photogrammetry_files import NAMES, edited
 from PIL import Image
 
 from mi_ring import convert
@@ -49,13 +49,6 @@ def refused(arguments, pattern, folder):
     with pytest.raises(InputError, match=pattern) as error:
         convert.main([*map(str, arguments), str(out)])
     assert "\n" not in str(error.value) and not out.parent.exists()
-
-
-def edited(path, old, new):
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
-    return path
 
 
 # Bundler

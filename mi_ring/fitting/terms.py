@@ -88,8 +88,8 @@ def calibration(it: Iteration) -> Tensor | None:
 def settling(it: Iteration) -> Tensor | None:
     """Compute the term `settling`: the variation of the material along the surface.
 
-    It reduces slow variation, which is probably an effect of the light. Returns None except in the
-    stage in which the surface is fixed.
+    It reduces slow variation, which is probably an effect of the light. Returns None except in the stage in which the
+    surface is fixed.
     """
     return priors.albedo_variation(it) if it.stage.settles else None
 

@@ -55,7 +55,8 @@ def genus(mesh: trimesh.Trimesh) -> int:
 def area_vectors(points: Tensor, faces: Tensor) -> Tensor:
     """Compute normals of triangles, each as long as twice the triangle's area: (F, 3).
 
-    `points` (V, 3), `faces` (F, 3): a mesh. Normals point to where the corners are seen counterclockwise.
+    `points` (V, 3), `faces` (F, 3): a mesh. Seen from where a normal points to, the corners are in counterclockwise
+    order.
     """
     a, b, c = (points[corner] for corner in faces.T)
     return torch.linalg.cross(b - a, c - a)

@@ -14,7 +14,7 @@ from mi_ring.foreign import require_readable
 from mi_ring.importers.camera_models import Lens, camera_to_world
 from mi_ring.importers.frames import Frame
 from mi_ring.importers.photogrammetry import Photogrammetry
-from mi_ring.importers.reading import read_as
+from mi_ring.importers.reading import has_byte_order_mark, read_as
 from mi_ring.system.optional import need
 
 NUMBER = re.compile(rb"[-+.\deE]+|nan|-?inf", re.I)
@@ -119,8 +119,8 @@ def is_model(folder: Path) -> bool:
 def camera_lines(path: Path) -> Iterator[tuple[bytes, int, list[bytes] | None]]:
     """Yield (line of the camera, number of the next line, words of the next line) for each camera in images.txt.
 
-    In this file, two lines describe a camera. The second has the image points; its words are None if the
-    file ends before it.
+    In this file, two lines describe a camera. The second has the image points. Its words are None if the file ends
+    before it.
     """
     lines = iter(enumerate(read_as(path, "text", lambda file: file.read_bytes().splitlines()), 1))
     for number, line in lines:
@@ -150,18 +150,17 @@ def count_images(folder: Path) -> int:
 def require_text(folder: Path) -> None:
     """Raise InputError if COLMAP would misread the text files of a model. Binary models are not checked.
 
-    It would ignore the digits after a decimal comma. If a camera in images.txt has no second line, which has its image
-    points and may be empty, it would read the next camera as points and lose it.
+    It would ignore the digits after a decimal comma. A camera in images.txt has a second line for its image points,
+    which may be empty. Without this line, COLMAP would read the next camera as points and lose it.
     """
     if (folder / "images.bin").is_file():
         return
     for path in filter(is_file, (folder / name for name in ("images.txt", "cameras.txt", "rigs.txt", "frames.txt"))):
-        content = read_as(path, "text", Path.read_bytes)
-        if content.startswith(b"\xef\xbb\xbf"):
+        if read_as(path, "text", has_byte_order_mark):
             raise InputError(f"{path}: begins with a byte order mark, which COLMAP does not read; save it without")
         if path.name == "images.txt":  # names of photographs may have commas; its numbers are checked below
             continue
-        data = re.sub(rb"^\s*#.*", b"", content, flags=re.MULTILINE)
+        data = re.sub(rb"^\s*#.*", b"", read_as(path, "text", Path.read_bytes), flags=re.MULTILINE)
         if bad := re.search(rb"\S*,\S*", data):
             raise InputError(f"{path}: has {bad[0].decode(errors='replace')}; must have decimal points, not commas")
     for line, number, words in camera_lines(path := folder / "images.txt"):

@@ -1,5 +1,6 @@
 """All formats by the names that `mi_ring.convert` uses, and functions that recognise the format of a file."""
 
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,7 +70,7 @@ def has_keyframes(folder: Path) -> bool:
 def begins(path: Path, word: bytes) -> bool:
     """Return True if a file begins with the bytes `word`, or with a byte order mark of UTF-8 and `word`."""
     with path.open("rb") as file:
-        return file.read(3 + len(word)).removeprefix(b"\xef\xbb\xbf").startswith(word)
+        return file.read(len(BOM_UTF8) + len(word)).removeprefix(BOM_UTF8).startswith(word)
 
 
 #: In the order in which `detect` takes them.

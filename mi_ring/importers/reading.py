@@ -2,6 +2,7 @@
 
 import json
 import os
+from codecs import BOM_UTF8
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
@@ -29,6 +30,12 @@ def read_as(path: Path, what: str, read: Callable[[Path], Content]) -> Content:
     """
     with reading(path, what):
         return read(existing(path, what))
+
+
+def has_byte_order_mark(path: Path) -> bool:
+    """Return True if a file begins with a byte order mark of UTF-8."""
+    with path.open("rb") as file:
+        return file.read(len(BOM_UTF8)) == BOM_UTF8
 
 
 def pixels_of(path: Path, heed: bool = False) -> np.ndarray:

@@ -72,7 +72,7 @@ def ring_of(state: dict) -> FittedObject:
     )  # fmt: skip
     ring.load_state_dict(state["networks"])
     for name, value in [*ring.named_parameters(), *ring.named_buffers()]:
-        found = state["networks"].get(name, value)  # without a buffer that is not saved
+        found = state["networks"].get(name, value)  # some buffers are not in the file
         require(found.is_floating_point() == value.is_floating_point(), f"{name} has numbers of another kind")
     require_valid(ring)
     return ring
@@ -118,12 +118,13 @@ def require_valid(ring: FittedObject) -> None:
     closed = trimesh.Trimesh(points, faces, process=False, validate=False).is_watertight
     require(closed, "the domain is no closed surface")
     for grid in [part for part in ring.modules() if isinstance(part, detail.Grid)]:
-        require(all(bool((grid.keys(k).diff() > 0).all()) for k in range(len(grid.cells))), "details are not in order")
-        for k in range(len(grid.cells))[:2]:  # the coarsest may fill the domain, the finest may miss some vertices
+        octaves = range(len(grid.cells))
+        require(all(bool((grid.keys(k).diff() > 0).all()) for k in octaves), "details are not in order")
+        for k in octaves[:2]:  # the coarsest cubes may be around all of the domain; the finest may miss some vertices
             inside = grid.octave_weights(torch.from_numpy(points), k)[0].sum(1) > 0.5
             require(bool(inside.float().mean() > 0.5), "details are elsewhere than the domain")
     for name, value in ring.named_buffers():
-        if re.search(r"\.?directions\d+$", name):
+        if re.search(r"directions\d+$", name):
             require(bool((value.norm(dim=1) < 1.01).all()), f"{name} are longer than 1")
 
 

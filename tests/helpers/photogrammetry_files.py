@@ -36,6 +36,14 @@ def text_of(array):
     return " ".join(map(repr, np.ravel(array).tolist()))
 
 
+def edited(path, old, new, count=-1):
+    """The path of a file, in which `old` has become `new`."""
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+    return path
+
+
 def metashape(folder, terms=SENSOR, kind="frame", where="component", more=""):
     """Cameras in the frame of a chunk, of which three photographs have one."""
     turn, shift, scale = CHUNK if where else (np.eye(3), np.zeros(3), 1.0)
