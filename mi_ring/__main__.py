@@ -55,8 +55,8 @@ def main() -> None:
         run("mi-ring", lambda _: print(__version__ if name == "--version" else overview()), [])
     if name not in COMMANDS:
         alike = "".join(f"; perhaps you meant {other}" for other in difflib.get_close_matches(name, COMMANDS, 1))
-        what = f"is {name}{alike}; must be one of {', '.join(COMMANDS)}" if name else "is missing"
-        print(f"mi-ring: COMMAND: {what}; mi-ring --help tells more", file=sys.stderr)
+        what = f": is {name}{alike}; must be one of {', '.join(COMMANDS)}" if name else " is missing"
+        print(f"mi-ring: COMMAND{what}; mi-ring --help tells more", file=sys.stderr)
         sys.exit(2)
     run(f"mi-ring {name}", partial(run_command, name), sys.argv[2:])
 

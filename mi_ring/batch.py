@@ -61,7 +61,7 @@ class BatchConfig:
             if not least <= getattr(self, name) < 10**6:
                 raise InputError(f"--{name}: is {getattr(self, name)}, must be {least} or more")
         if not self.scenes:
-            raise InputError("SCENE.xml: is missing; name one or more")
+            raise InputError("SCENE.xml is missing; name one or more")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -33,10 +33,10 @@ class DoctorConfig:
 class Finding(NamedTuple):
     """One line of the output of mi-ring doctor: (mark, what was examined, text).
 
-    The mark is "ok", "MISSING" if a fit cannot run without it, or "without" if only another feature needs it.
+    The mark is "ok", "MISSING" if a fit cannot run without it, or "absent" if only another feature needs it.
     """
 
-    mark: str  #: ok; MISSING: a fit cannot run; without: something else cannot run
+    mark: str  #: ok; MISSING: a fit cannot run; absent: something else cannot run
     what: str
     text: str
 
@@ -56,12 +56,12 @@ def findings() -> Iterator[Finding]:
     if not llvm.has_atomic():
         yield Finding("MISSING", "libatomic", str(problem))
         problem = None if llvm.find() else f"mi_ring needs version {llvm.OLDEST} or newer. {llvm.cure('libllvm19')}"
-    yield Finding("MISSING" if problem else "ok", "LLVM", problem or "for the variant llvm_ad_rgb: there")
+    yield Finding("MISSING" if problem else "ok", "LLVM", problem or "found; for the variant llvm_ad_rgb")
     for package, use in OPTIONAL.items():
         if importlib.util.find_spec(package):
             yield Finding("ok", package, importlib.metadata.version(package))
         else:
-            yield Finding("without", package, f"for {use}: pip install {package} (not available for all systems)")
+            yield Finding("absent", package, f"for {use}: pip install {package} (not available for all systems)")
     if llvm.has_atomic() and importlib.util.find_spec("torch"):  # otherwise Dr.Jit or torch cannot be imported
         yield from computing()
 
@@ -80,7 +80,7 @@ def computing() -> Iterator[Finding]:
     if torch.cuda.is_available() and dr.has_backend(dr.JitBackend.CUDA):
         yield Finding("ok", "GPU", f"{torch.cuda.get_device_name()}: --variant cuda_ad_rgb")
     else:
-        yield Finding("without", "GPU", "for --variant cuda_ad_rgb: needs an NVIDIA GPU and a PyTorch built for CUDA")
+        yield Finding("absent", "GPU", "for --variant cuda_ad_rgb: needs an NVIDIA GPU and a PyTorch built for CUDA")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.colour_profiles import as_stated
-from mi_ring.errors import InputError
+from mi_ring.errors import LARGEST, InputError
 from mi_ring.foreign import require_plausible_size
 from mi_ring.image_headers import (
     RAW,
@@ -83,8 +83,9 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
     `heed`: True applies the colour space that the file declares. The result is then sRGB if it is uint8, otherwise
     linear with sRGB's primaries. False returns the pixels as they are stored.
 
-    Raises ValueError for CMYK, for integers of more than 16 bits, for files of several pictures and for an implausible
-    size. The size is checked before memory is allocated. Damaged files raise errors of other types.
+    Raises ValueError for CMYK, for integers of more than 16 bits, for floats that are NaN, infinite or above 1e18, for
+    files of several pictures and for an implausible size. The size is checked before memory is allocated. Damaged files
+    raise errors of other types.
     """
     suffix = path.suffix.lower()
     if suffix in TIFF:
@@ -104,6 +105,8 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
                     image = image.convert("L" if image.mode == "1" else "RGB")
                 pixels = np.asarray(image)  # without a copy: it may be large
     pixels = pixels if pixels.ndim == 3 else pixels[:, :, None]
+    if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
+        raise ValueError(f"contains pixels that are NaN, infinite or above {LARGEST:g}")
     return as_stated(pixels, statement_of(path)) if heed else pixels
 
 

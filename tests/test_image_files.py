@@ -65,6 +65,10 @@ def write_dng(path):
     ])  # fmt: skip
 
 
+#: of an animation
+TWO_PICTURES = {"save_all": True, "append_images": [Image.new("RGB", (30, 22), "red")]}
+
+
 def by_pillow(suffix, **options):
     return lambda path, linear: Image.fromarray(eight(linear)).save(path.with_suffix(suffix), **options)
 
@@ -428,6 +432,10 @@ def test_associated_alpha_of_tiff_is_undone(tmp_path):
     (by_tiff(photometric="ycbcr"), "its colours are YCBCR; save it as RGB"),
     (lambda path, a: tifffile.imwrite(path.with_suffix(".tif"), np.stack([eight(a)] * 3), photometric="rgb"),
      "has 3 pictures; save the photograph alone"),
+    (by_pillow(".webp", **TWO_PICTURES), "has 2 pictures; save the photograph alone"),
+    (by_pillow(".png", **TWO_PICTURES), "has 2 pictures; save the photograph alone"),
+    (tiff(lambda a: np.where(a > 0.5, np.nan, a).astype(np.float32)), "contains pixels that are NaN, infinite"),
+    (lambda path, a: exr(path, np.where(a > 0.5, np.inf, a)), "contains pixels that are NaN, infinite or above 1e"),
     (exr_of("N.X", "N.Y", "N.Z"), "has channels N.X, N.Y, N.Z, but no R, G, B"),
     (exr_of("X", "Y", "Z"), "has channels X, Y, Z, but no R, G, B"),
     (exr_integers, "has integers in the channels R, G, B; save them as floats"),

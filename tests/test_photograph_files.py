@@ -42,9 +42,21 @@ def files(*names, root="/data/photos"):
     ("2.jpg", "2.png"), ("gone/2.jpg", "2.png"), ("C:2.png", None), ("photos/2", "2.png"), ("3.png", None),
     ("IMG.2", "IMG.2.jpg"), ("IMG.9", None), ("", None), ("/", None), ("e-w", None),
     ("Cafe\u0301.png", "caf\xe9.png"), ("masks/5.png", "masks/5.png"), ("5.png", None), ("other/1.JPG", None),
+    ("my%20pot.png", "my pot.png"), ("50%25.png", "50%25.png"), ("x%2Fy.png", None),
 ])  # fmt: skip
 def test_a_photograph_is_found_by_its_name_and_as_many_folders_as_are_needed(path, found):
-    folder = files("n-s/1.JPG", "e-w/1.JPG", "2.png", "IMG.2.jpg", "IMG.3.jpg", "caf\xe9.png", "masks/5.png")
+    folder = files(
+        "n-s/1.JPG",
+        "e-w/1.JPG",
+        "2.png",
+        "IMG.2.jpg",
+        "IMG.3.jpg",
+        "caf\xe9.png",
+        "masks/5.png",
+        "my pot.png",
+        "50%25.png",
+        "50%.png",
+    )
     file, _ = folder.find(path)
     assert file == (found and Path("/data/photos", found))
 

@@ -399,7 +399,7 @@ def test_shifts_are_measured_to_a_fraction_of_a_pixel():
 def panel(result, k):
     """The row of photograph `k` in the report."""
     surface = result.drawn(result.ring.subdivisions)
-    return report.panel_of(result, k, report.predicted(result, surface, np.array([k]))[0])[0]
+    return report.panel_of(result, report.white(result.ring), k, report.predicted(result, surface, np.array([k]))[0])[0]
 
 
 def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, broken_capture):

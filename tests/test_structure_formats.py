@@ -204,6 +204,13 @@ def test_a_camera_without_a_pose_in_its_rig(tmp_path):
     refused(["colmap", tmp_path], "rigs: camera 2 of rig/right/1.png has no pose in its rig; let", tmp_path)
 
 
+def test_a_camera_without_a_rotation_in_its_rig(tmp_path):
+    rigs = structure_files.colmap_rig(tmp_path) / "rigs.txt"
+    words = rigs.read_text().split()
+    rigs.write_text(" ".join([*words[:7], "0 0 0 0", *words[11:]]))
+    refused(["colmap", tmp_path], "rigs: the quaternion of camera 2 is 0 0 0 0; must have length 1", tmp_path)
+
+
 @pytest.mark.parametrize("scale", [1.0, 2.5])
 def test_rigs_of_metashape_are_composed(tmp_path, scale):
     source = Metashape(structure_files.metashape_rig(tmp_path, scale), Path())

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mi_ring.colour_profiles import srgb_to_linear
-from mi_ring.errors import LARGEST, InputError, is_file
+from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading
 from mi_ring.image_headers import image_size
 from mi_ring.images import contrasted, linear_to_srgb, mask_values, read_image
@@ -79,10 +79,7 @@ def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
     require_header(path, field, shot, scene)
     what = f'photograph "{shot.name}", {field}'
     with reading(f"{path}: {what}", "an image"):
-        pixels = read_image(path, heed=shot.encoding == "auto" and field in ("filename", "ambient"))
-    if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
-        raise InputError(f"{path}: {what}: contains pixels that are NaN, infinite or above {LARGEST:g}")
-    return pixels
+        return read_image(path, heed=shot.encoding == "auto" and field in ("filename", "ambient"))
 
 
 def require_header(path: Path, field: str, shot: Shot, scene: Path) -> None:

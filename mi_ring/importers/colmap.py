@@ -87,6 +87,12 @@ class Colmap(Photogrammetry):
             names = [(image.name, k) for k, image in reconstruction.images.items()]  # fails if not UTF-8
         except Exception as error:
             raise InputError(f"{model}: not a COLMAP model ({' '.join(str(error).split())})") from error
+        for rig in reconstruction.rigs.values():
+            for sensor, pose in rig.non_ref_sensors.items():
+                if pose and not any(pose.rotation.quat):
+                    raise InputError(
+                        f"{model}: rigs: the quaternion of camera {sensor.id} is 0 0 0 0; must have length 1"
+                    )
         texts = {} if (model / "images.bin").is_file() else names_in(model / "images.txt")
         names = sorted((texts.get(k, name), k) for name, k in names)
         if not registered:

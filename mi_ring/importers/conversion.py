@@ -14,7 +14,7 @@ from mi_ring.images import mask_values
 from mi_ring.importers.frames import Frame, Source, adapt_all, frames_of, require_frames, turn_masks
 from mi_ring.importers.named_photographs import counted, few
 from mi_ring.importers.photograph_files import parts_of, stem_of
-from mi_ring.importers.reading import pixels_of, read_as, saturations_of
+from mi_ring.importers.reading import bits_of, pixels_of, read_as, saturations_of
 from mi_ring.importers.writer import Writer, write_frame
 from mi_ring.scene.shot import Shot
 from mi_ring.system.progress import progress
@@ -42,6 +42,8 @@ def write_scene(source: Source) -> list[Frame]:
             frame.encoding = source.encoding
         if frame.pixels is None:
             read_as(frame.image, "image", require_whole)
+            if bits_of(frame.image) == 32:
+                pixels_of(frame.image)  # refuses NaN
         if frame.pixels is None and frame.encoding == "auto":
             read_as(frame.image, "image", encoding_of)  # refuses HDR curves and unknown profiles
     if mask := next((frame.mask for frame in frames if frame.mask not in (None, frame.image)), None):

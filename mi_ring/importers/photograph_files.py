@@ -5,6 +5,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
+from urllib.parse import unquote
 
 from mi_ring.errors import InputError
 
@@ -37,7 +38,7 @@ def stem_of(name: str) -> str:
 class PhotographFiles:
     """Index of image files. It finds the file for a path that another tool has written, perhaps on another computer.
 
-    Path and file may differ in case, suffix, drive and leading folders. If several files have the name of the path, the
+    Path and file may differ in case, suffix, drive, leading folders and percent encoding (`a%20b.jpg`). If several files have the name of the path, the
     one whose folders match best is found. `root`: folder that contains all `files`.
     """
 
@@ -81,7 +82,8 @@ class PhotographFiles:
             unlike = [file.name != name_of(path), own_name != name, stem_of(own_name) != name]
             ranks[file] = (bool(more and len(folders) > agree), -agree, more, [*unlike[:2], all(unlike[1:])])
         if not ranks:
-            return None, False
+            plain = unquote(path)  # of addresses, in which %20 stands for a space
+            return self.find(plain) if plain != path else (None, False)
         best = min(ranks.values())
         found = [file for file, rank in ranks.items() if rank == best]
         contrary = best[0]

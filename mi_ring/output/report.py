@@ -35,6 +35,7 @@ from mi_ring.version import __version__
 REGISTERED = 1024  # largest side of the pictures whose shift is measured [px]
 TOGETHER = 4  # photographs that are drawn at once
 PICTURE = 480  # largest side of the pictures on the page [px]
+WHITE_LEVEL = 5  # of the mesh at whose vertices the largest value of a BSDF parameter is looked for
 
 # Thresholds of the findings.
 LOW_PSNR, LOW_IOU = 3.0, 0.9  # PSNR below the median of all photographs [dB]; IoU of prediction and mask
@@ -67,7 +68,7 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     capture, ring, refined = result.capture, result.ring, result.calibration
     surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
-    parts = pipelined(partial(predicted, result, surface), partial(panels_of, result), some)
+    parts = pipelined(partial(predicted, result, surface), partial(panels_of, result, white(ring)), some)
     panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
     rows = [row for row, _ in panels]
     # All photographs on the page may be held-out ones.
@@ -233,23 +234,36 @@ def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Pr
     ]
 
 
+def white(ring: FittedObject) -> dict[str, float]:
+    """Return for each BSDF parameter the value that the report shows as white. The surface has hardly any above it."""
+    material = ring.material(ring.domain.sample(min(WHITE_LEVEL, ring.subdivisions))[0])
+    parameters = ring.brdf_net.bsdf_parameters
+    largest = {p: float(np.quantile(material[p.name].detach().cpu().numpy(), 0.99)) for p in parameters}
+    return {p.name: max(value, p.low + 1e-6) for p, value in largest.items()}
+
+
 def panels_of(
-    result: FitResult, index: np.ndarray, predictions: Sequence[PredictedPhotograph]
+    result: FitResult, white: dict[str, float], index: np.ndarray, predictions: Sequence[PredictedPhotograph]
 ) -> list[tuple[PhotographPanel, float]]:
     """Compare photographs with their predictions. Returns (panel, mean squared sRGB error) for each, in this order.
 
-    `index` (n,): indices of the photographs. `predictions`: their n rendered predictions.
+    `white`: as the function of this name returns it. `index` (n,): indices of the photographs. `predictions`: their n
+    rendered predictions.
     """
-    return [panel_of(result, int(k), prediction) for k, prediction in zip(index, predictions)]
+    return [panel_of(result, white, int(k), prediction) for k, prediction in zip(index, predictions)]
 
 
-def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tuple[PhotographPanel, float]:
+def panel_of(
+    result: FitResult, white: dict[str, float], k: int, prediction: PredictedPhotograph
+) -> tuple[PhotographPanel, float]:
     """Compare photograph `k` with its prediction. Returns (panel for the report, mean squared sRGB error).
+
+    `white`: as the function of this name returns it.
 
     The error is the mean over all valid pixels. If the room was lit and the photograph has a mask, it is the mean over
     the valid pixels in the mask.
     """
-    capture, brdf_net = result.capture, result.ring.brdf_net
+    capture = result.capture
     scale = scale_of(result, capture.shots[k].size)
     seen, maps = capture.observe([k], scale), prediction.maps
     observed, saturated, mask, masked = (t[0].numpy() for t in seen[:4])
@@ -268,12 +282,9 @@ def panel_of(result: FitResult, k: int, prediction: PredictedPhotograph) -> tupl
         "4 × difference": 4 * np.abs(photo - guess) * compared[..., None],
         "normals": normal,
     }
-    for p in brdf_net.bsdf_parameters:
-        if math.isinf(p.high):
-            pictures[p.name] = linear_to_srgb((maps[p.name] - p.low) / (2.5 * float(brdf_net.scale)))
-        else:
-            value = (maps[p.name] - p.low) / (p.high - p.low)
-            pictures[p.name] = linear_to_srgb(value) if p.channels == 3 else value
+    for p in result.ring.brdf_net.bsdf_parameters:
+        value = (maps[p.name] - p.low) / (white[p.name] - p.low)
+        pictures[f"{p.name}, white is {white[p.name]:.2g}"] = linear_to_srgb(value) if p.channels == 3 else value
     error = float(np.mean((photo - guess)[compared] ** 2))
     by = shift(photo * inside[..., None] if masked else photo, guess, inside | found)
     along, down = shot.window.scale if shot.window else (1.0, 1.0)

@@ -37,12 +37,14 @@ class RefinementSettings(NamedTuple):
     agreement: float  #: share of the masks that must contain a voxel
     band: float  #: width of the band around the silhouette in which GrabCut decides [object's size]
     iterations: int  #: maximum number
+    finds: str  #: what it finds, for the progress bar
     reject_outliers: bool = True  #: leave incomplete masks out of the vote
 
 
-LOCATION = RefinementSettings(MIN_AGREEMENT, 0.04, 6, False)
-CONCAVITIES = RefinementSettings(0.96, 0.15, 2)  #: high agreement, because few photographs see through a concavity
-OUTLINES = RefinementSettings(0.96, 0.04, 2)
+LOCATION = RefinementSettings(MIN_AGREEMENT, 0.04, 6, "the object's place", False)
+#: high agreement, because few photographs see through a concavity
+CONCAVITIES = RefinementSettings(0.96, 0.15, 2, "openings")
+OUTLINES = RefinementSettings(0.96, 0.04, 2, "outlines")
 
 
 @dataclass
@@ -179,7 +181,7 @@ def refine_masks(
     silhouettes = [found.silhouette(view) for view in grid.views] if found else []
     for number in range(settings.iterations if found else 0):
         before, outlined = masks, in_threads(outline, grid.views, silhouettes, backgrounds)
-        masks = list(progress(outlined, f"masks, round {number + 1}", len(silhouettes)))
+        masks = list(progress(outlined, f"masks, {settings.finds}, round {number + 1}", len(silhouettes)))
         voters = are_complete(grid.views, masks, silhouettes) if settings.reject_outliers else None
         if (found := grid.vote(masks, settings.agreement, voters)) is None:
             break

@@ -103,8 +103,8 @@ def plain(complaint: str, help_text: str) -> str:
         meant = f"; perhaps you meant {', '.join(alike)}" if alike else ""
         return f"{name_in_help(wrong[2])}: is {wrong[1]}; must be one of {', '.join(choices)}{meant}"
     if wrong := re.match(r"Missing value for argument '(\S+)'\. Expected (\d+) values", complaint):
-        has_none = "has no value" if wrong[1].startswith("--") else "is missing; --help tells more"
-        return f"{name_in_help(wrong[1])}: {has_none if wrong[2] == '1' else f'must be {wrong[2]} values'}"
+        has_none = ": has no value" if wrong[1].startswith("--") else " is missing; --help tells more"
+        return name_in_help(wrong[1]) + (has_none if wrong[2] == "1" else f": must be {wrong[2]} values")
     union = r"Error parsing (\S+): no type matching (.*) could be instantiated from \[(.*?)\]"
     if wrong := re.match(union, complaint):  # tyro's reasons for each type are left out
         kinds = re.sub("[{}]", "", wrong[2].replace("{None}|", "")).replace(",", "|")

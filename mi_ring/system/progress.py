@@ -14,6 +14,8 @@ from tqdm import tqdm
 
 Progress = Callable[..., Iterable]  #: the type of `progress`, and of substitutes that show nothing
 DELAY, LOG_INTERVAL = 2.0, 30.0  #: seconds before the first line in a log, and between two lines
+KNOWN = 0.1  #: share of the work of all steps whose time tells how long the rest will take
+BEGUN = 0.05  #: share of a bar that tells how long the rest of it will take
 
 
 @contextlib.contextmanager
@@ -71,7 +73,30 @@ class TolerantStream:
             os.dup2(null.fileno(), self.stream.fileno())
 
 
-class LogBar(tqdm):
+class Bar(tqdm):
+    """A progress bar that also says how long all steps of the command will still take, if it has `Steps`."""
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        """The values that tqdm writes. Their prefix has the time that all steps still need."""
+        values = super().format_dict
+        if Steps.current and (left := Steps.current.left(self.seconds_left(values))) is not None:
+            values["prefix"] = f"{values['prefix'].removesuffix(': ')}, all done in {rounded_time(left)}"
+        return values
+
+    @staticmethod
+    def seconds_left(values: dict[str, Any]) -> float | None:
+        """Estimate the seconds that the bar itself still needs, from tqdm's `values`. None: too early to tell."""
+        n, total, elapsed = values["n"], values["total"], values["elapsed"]
+        return elapsed * (total - n) / n if total and n >= BEGUN * total and elapsed >= DELAY else None
+
+
+def rounded_time(seconds: float) -> str:
+    """Write a time as whole minutes, or, below 90 seconds, as whole tens of seconds."""
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{10 * max(1, round(seconds / 10))} s"
+
+
+class LogBar(Bar):
     """A progress bar for a log file. It writes a line every `LOG_INTERVAL` seconds, and one at the end."""
 
     written, line = -math.inf, ""  #: when the last line was written [s], and its text
@@ -112,6 +137,7 @@ class Steps:
 
     def __init__(self, *steps: Step) -> None:
         self.steps, self.number, self.started = steps, 0, time.monotonic()
+        self.before = 0.0  # seconds that the steps before the present one took
 
     def __enter__(self) -> "Steps":
         Steps.current = self
@@ -121,21 +147,32 @@ class Steps:
         Steps.current = None
 
     def named(self, what: str) -> str:
-        """Return the text for a progress bar: its name `what` with the number of its step and the time still needed.
+        """Return the text for a progress bar: its name `what` with the number of its step.
 
-        The time is that of all steps that are left. If no step that is left has a bar of this name, returns `what`
-        unchanged.
+        If no step that is left has a bar of this name, returns `what` unchanged.
         """
         ahead = range(self.number, len(self.steps))
         found = next((n for n in ahead if what.startswith(self.steps[n].bars)), None)
         if found is None:
             return what
-        self.number = found
-        name = f"step {found + 1}/{len(self.steps)}, {what}"
-        done, left = (sum(step.seconds for step in part) for part in (self.steps[:found], self.steps[found:]))
-        if not done or (elapsed := time.monotonic() - self.started) < DELAY:
-            return name  # nothing is known yet of this machine's speed
-        return f"{name}, all steps {tqdm.format_interval(elapsed / done * left)} more"
+        if found > self.number:
+            self.number, self.before = found, time.monotonic() - self.started
+        return f"step {found + 1}/{len(self.steps)}, {what}"
+
+    def left(self, bar_left: float | None) -> float | None:
+        """Estimate the seconds that all steps still need together. Returns None if too little is done to tell.
+
+        `bar_left`: seconds that the present bar still needs; None: unknown.
+        """
+        done = sum(step.seconds for step in self.steps[: self.number])
+        here, total = self.steps[self.number].seconds, sum(step.seconds for step in self.steps)
+        elapsed = time.monotonic() - self.started
+        slowness = []  # seconds here for each second that was measured
+        if done > KNOWN * total:
+            slowness.append(self.before / done)
+        if bar_left is not None and done + here > KNOWN * total:
+            slowness.append((elapsed + bar_left) / (done + here))
+        return max(max(slowness) * total - elapsed, bar_left or 0.0) if slowness else None
 
 
 def progress(
@@ -147,7 +184,7 @@ def progress(
     finished. `options`: other options of tqdm. If standard error is not a terminal, it writes a line every 30 seconds,
     and none if the work takes less than two seconds.
     """
-    kind, what = tqdm, Steps.current.named(what) if Steps.current else what
+    kind, what = Bar, Steps.current.named(what) if Steps.current else what
     if not getattr(sys.stderr, "isatty", bool)():
         kind = LogBar
         # At position 0, tqdm would end with a carriage return.
