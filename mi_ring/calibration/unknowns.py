@@ -195,7 +195,10 @@ class LightPlace(Unknown):
 
 
 class Exposure(Unknown):
-    """Base class of `Power` and `Gain`: logarithm of a factor for each photograph and colour channel, with mean 0."""
+    """Base class of `Power` and `Gain`: logarithm of a factor for each photograph and colour channel.
+
+    In each channel, its mean over the photographs is 0.
+    """
 
     solved = True
 

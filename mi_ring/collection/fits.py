@@ -54,7 +54,7 @@ def run(command: list[str], job: Job, on_line: Callable[[str], None] | None = No
     """Run a fit in a child process, and append its output to the file `job.output`.
 
     `command`: the command line. `on_line` is called with each printed line. Returns (exit status, last line of the
-    output or reason for its end). If this process ends, the fit ends, too.
+    output, or the reason why the fit ended). If this process ends, the fit ends, too.
     """
     cwd = job.cwd if job.cwd.is_dir() else None  # a worker on another machine may lack this folder
     options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}

@@ -90,7 +90,8 @@ class Common:
     single photographs: cameras, power and gain."""
     iterations: int = 460
     """Number of iterations of all stages together, for example 1400. More iterations give finer detail and take longer.
-    A fit from a hull or a mesh makes fewer iterations. A fit under an unknown environment makes 15 % more."""
+    That is for a start from a sphere. A fit from a hull or a mesh leaves out two thirds of those of the first stage.
+    A fit under an unknown environment makes 15 % more."""
     seed: int = 0
     """Random seed. Fits with different seeds show how much results vary by chance."""
     deterministic: bool = False

@@ -47,7 +47,7 @@ class Refinement(NamedTuple):
 
 
 def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
-    """List the options of `--refine` that a fit refines, in a fixed order. The capture decides what `auto` means.
+    """List the values of `--refine` that a fit refines, in a fixed order. The capture decides what `auto` means.
 
     `light`: kind of the light, such as "capture" or "lamps". `albedo`: of the object, computed from the lights'
     strengths.

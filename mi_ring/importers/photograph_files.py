@@ -38,8 +38,9 @@ def stem_of(name: str) -> str:
 class PhotographFiles:
     """Index of image files. It finds the file for a path that another tool has written, perhaps on another computer.
 
-    Path and file may differ in case, suffix, drive, leading folders and percent encoding (`a%20b.jpg`). If several files have the name of the path, the
-    one whose folders match best is found. `root`: folder that contains all `files`.
+    Path and file may differ in case, suffix, drive, leading folders and percent encoding (`a%20b.jpg`). If several
+    files have the name of the path, the one whose folders match best is found. `root`: folder that contains all
+    `files`.
     """
 
     def __init__(self, files: Iterable[Path], root: Path, affix: re.Pattern[str] | None = None) -> None:

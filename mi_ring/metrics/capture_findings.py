@@ -44,7 +44,7 @@ def odd_powers(photographs: dict[str, dict[str, Any]]) -> str:
 
 
 def findings_of_fit(scene: Path, names: Collection[str]) -> tuple[str, str]:
-    """Read calibration.json beside a scene file, which a fit has written. Returns two texts for the user.
+    """Read calibration.json, which a fit has written beside a scene file. Returns two texts for the user.
 
     They name the photographs whose camera the fit has moved far, and those whose light is much stronger or weaker than
     the others. `names`: only these photographs count. Both texts are empty if there is no such file.

@@ -76,7 +76,7 @@ class RenderConfig(MaterialOptions):
     path traces all reflections, also in scenes with other objects. It has more noise and ignores a `table` shape."""
     format: Literal["png", "exr"] | None = None
     """Format of the pictures. png: 8-bit sRGB. exr: linear radiance.
-    Without this option: that of the file names in the scene; png for --turntable, --light-orbit and --flow."""
+    Without this option: the format of the file names in the scene; png for --turntable, --light-orbit and --flow."""
     fps: float = 24.0
     """Pictures per second of an MP4 film, above 0, at most 240. The film is slower with fewer pictures per second."""
     time: float = 1.0

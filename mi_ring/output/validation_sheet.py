@@ -50,9 +50,9 @@ def strip(row: Comparison, pictures: Pictures) -> Image.Image:
 
 
 def validation_sheet(strips: list[Image.Image]) -> bytes:
-    """Arrange the rows of all photographs in a contact sheet that is about square. Returns the bytes of a PNG file.
+    """Arrange strips of pictures in a contact sheet that is about square. Returns the bytes of a PNG file.
 
-    `strips`: a picture for each row, at least one.
+    `strips`: one for each photograph, at least one.
     """
     width, height = strips[0].width + 12, max(line.height for line in strips)
     stacks = max(1, round(np.sqrt(len(strips) * height / width)))
