@@ -75,8 +75,9 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         with image:
             if image.mode in ("CMYK", "YCCK"):
                 raise ValueError("its colours are those of inks, CMYK; save it as RGB")
-            if getattr(image, "is_animated", False) and image.format not in ("MPO", "HEIF"):  # with previews
-                raise ValueError(f"has {image.n_frames} pictures; save the photograph alone")
+            count = getattr(image, "n_frames", 1)
+            if count > 1 and image.format not in ("MPO", "HEIF"):  # with previews
+                raise ValueError(f"has {count} pictures; save the photograph alone")
             bands = 4 if image.has_transparency_data else len(image.getbands())  # palettes become RGBA
             require_plausible_size(path, 2 * bands * math.prod(image.size))
             yield image

@@ -195,10 +195,7 @@ class LightPlace(Unknown):
 
 
 class Exposure(Unknown):
-    """Base class of `Power` and `Gain`: logarithm of a factor for each photograph and colour channel.
-
-    In each channel, its mean over the photographs is 0.
-    """
+    """Base of `Power` and `Gain`: log of a factor for each photograph and channel. In each channel its mean is 0."""
 
     solved = True
 
