@@ -60,8 +60,8 @@ class BoundedFile(io.BufferedReader):
 def open_image(path: Path) -> Iterator[Image.Image]:
     """Context manager that opens an image file with Pillow, without reading its pixels. Not for OpenEXR and raw files.
 
-    Raises ValueError if the file is no image, is CMYK, is animated or declares an implausible size. Raises InputError
-    for a HEIF file if the package pillow_heif is not installed. A damaged file raises errors of other types.
+    Raises ValueError if the file is no image, is CMYK or declares an implausible size. Raises InputError for a HEIF
+    file if the package pillow_heif is not installed. A damaged file raises errors of other types.
     """
     if path.suffix.lower() in HEIF:
         need("pillow_heif", f"{path}").register_heif_opener()
@@ -75,9 +75,6 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         with image:
             if image.mode in ("CMYK", "YCCK"):
                 raise ValueError("its colours are those of inks, CMYK; save it as RGB")
-            count = getattr(image, "n_frames", 1)
-            if count > 1 and image.format not in ("MPO", "HEIF"):  # with previews
-                raise ValueError(f"has {count} pictures; save the photograph alone")
             bands = 4 if image.has_transparency_data else len(image.getbands())  # palettes become RGBA
             require_plausible_size(path, 2 * bands * math.prod(image.size))
             yield image

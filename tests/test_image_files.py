@@ -65,10 +65,6 @@ def write_dng(path):
     ])  # fmt: skip
 
 
-#: of an animation
-TWO_PICTURES = {"save_all": True, "append_images": [Image.new("RGB", (30, 22), "red")]}
-
-
 def by_pillow(suffix, **options):
     return lambda path, linear: Image.fromarray(eight(linear)).save(path.with_suffix(suffix), **options)
 
@@ -227,7 +223,7 @@ def test_floats_are_linear_photographs_for_photos(tmp_path):
     file = written(tmp_path, "tiff float", bright)
     np.testing.assert_allclose(Picture(file).to_linear(Picture(file).pixels), bright.clip(0, 1), atol=1e-5)
     tifffile.imwrite(file, np.full((H, W, 3), np.nan, np.float32), photometric="rgb")
-    with pytest.raises(InputError, match="contains pixels that are NaN or infinite"):
+    with pytest.raises(InputError, match="contains pixels that are NaN, infinite or above"):
         _ = Picture(file).pixels
 
 
@@ -432,8 +428,6 @@ def test_associated_alpha_of_tiff_is_undone(tmp_path):
     (by_tiff(photometric="ycbcr"), "its colours are YCBCR; save it as RGB"),
     (lambda path, a: tifffile.imwrite(path.with_suffix(".tif"), np.stack([eight(a)] * 3), photometric="rgb"),
      "has 3 pictures; save the photograph alone"),
-    (by_pillow(".webp", **TWO_PICTURES), "has 2 pictures; save the photograph alone"),
-    (by_pillow(".png", **TWO_PICTURES), "has 2 pictures; save the photograph alone"),
     (tiff(lambda a: np.where(a > 0.5, np.nan, a).astype(np.float32)), "contains pixels that are NaN, infinite"),
     (lambda path, a: exr(path, np.where(a > 0.5, np.inf, a)), "contains pixels that are NaN, infinite or above 1e"),
     (exr_of("N.X", "N.Y", "N.Z"), "has channels N.X, N.Y, N.Z, but no R, G, B"),

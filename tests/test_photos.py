@@ -201,7 +201,7 @@ def test_masks_that_the_user_brings(folder, brought, tmp_path):
     (["{folder}", "out", "--box", "0", "1", "0", "1", "0", "1"], "--box: is in the frame of the sheet"),
     (["{folder}", "out", "--box", "0", "1", "1", "0", "0", "1"], "--box: is 0.0 1.0 1.0 0.0 0.0 1.0, must be lowest"),
     (["{folder}"], "DIR is missing; --help tells more"),
-    ([], "FOLDER and DIR: are missing; --help tells more"),
+    ([], "FOLDER and DIR are missing; --help tells more"),
     (["{folder}", "out", "--flash-offset", "1"], "--flash-offset: must be 3 values"),
     (["{folder}", "out", "--masks", "typo"], "--masks: typo: no such folder; give auto"),
 ])  # fmt: skip

@@ -63,8 +63,6 @@ class Picture:
         """
         pixels = read_as(self.path, "photograph", partial(read_image, heed=True))
         if pixels.dtype == np.float32:
-            if not np.isfinite(pixels).all():
-                raise InputError(f"{self.path}: contains pixels that are NaN or infinite")
             pixels = (pixels.clip(0, 1) * 65535 + 0.5).astype(np.uint16)
         count = pixels.shape[2]
         return pixels[:, :, [0, 0, 0, *range(1, count)]] if count < 3 else pixels  # grey, with alpha or without

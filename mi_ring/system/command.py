@@ -84,7 +84,7 @@ def complaint_in(box: str) -> str:
     if parts[0] and parts[0][0].strip().startswith("Missing from "):  # names are indented, and help texts further
         indents = [len(line) - len(line.lstrip()) for line in parts[0][1:]]
         names = [line.split()[0] for line, indent in zip(parts[0][1:], indents) if indent == min(indents)]
-        return f"{' and '.join(names)}: {'is' if len(names) == 1 else 'are'} missing; --help tells more"
+        return f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} missing; --help tells more"
     parts = [[line.strip() for line in part if line.strip()] for part in parts]
     advice = {part[0]: part[1:] for part in parts[1:] if part}
     complaint = plain(" ".join(parts[0]) or " ".join(box.split()), " ".join(advice.get("Argument helptext:", [])))
