@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> None:
     dpi = 25.4 * DOTS
     options = {"resolution": dpi, "title": "mi_ring board"} if kind == ".pdf" else {"dpi": (dpi, dpi)}
     write_file(file, encoded_picture(page(config.paper), kind[1:], **options))
-    print(f'{file}\nPrint it at 100 % ("actual size") and measure: five squares must be 100 mm long.')
+    print(f'{file}\nPrint it at 100% ("actual size") and measure: five squares must be 100 mm long.')
 
 
 if __name__ == "__main__":

@@ -341,7 +341,7 @@ def test_what_cannot_be_done_is_one_line(sphere_run, tmp_path, capsys):
         (["--mesh", truth, "--out", str(sphere_run / "mesh.ply")], ["mesh.ply", "--out", ".json"]),
         (["--mesh", str(points)], ["points.ply", "mesh", "no triangles"]),
         (["--mesh", truth, "--spp", "0"], ["--spp", "at least 1"]),
-        ([], ["mi_ring.evaluate: --mesh: is missing"]),
+        ([], ["mi_ring.evaluate: --mesh is missing"]),
     ):
         with pytest.raises(SystemExit) as stop:
             run("mi_ring.evaluate", evaluate.main, [str(sphere_run), *options])

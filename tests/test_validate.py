@@ -144,7 +144,7 @@ def test_interreflection_inside_a_ball_is_the_closed_form(tmp_path, capsys, dept
     assert row["absolute_difference"] == pytest.approx(share, rel=0.02)  # photometric is darker everywhere
     assert row["shadows"] == pytest.approx(0, abs=1e-3)
     said = capsys.readouterr().out
-    assert f"interreflection is {100 * row['interreflection']:.2f} % of the light" in said
+    assert f"interreflection is {100 * row['interreflection']:.2f}% of the light" in said
 
 
 def test_share_of_a_shadow_is_that_of_its_projection(tmp_path):

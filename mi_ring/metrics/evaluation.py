@@ -24,7 +24,7 @@ LINES = {  # text of each line of the table, by the prefix of the names of its n
     "flipped": "seen from the back, share", "unseen": "shown by no photograph, share",
     "aligned": "truth moved by °, % of the diagonal, factor",
     "chamfer": "Chamfer distance, % of the diagonal",
-    **{f"f_score_{t}": f"F-score at {t} % of the diagonal" for t in THRESHOLDS}, "genus": "genus",
+    **{f"f_score_{t}": f"F-score at {t}% of the diagonal" for t in THRESHOLDS}, "genus": "genus",
     "self_intersections": "triangles that cross others", "inside_out": "triangles turned inside out",
     "psnr": "PSNR, dB", "ssim": "SSIM",
 }  # fmt: skip

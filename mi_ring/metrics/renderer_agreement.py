@@ -125,7 +125,7 @@ def all_as_one(rows: list[Comparison]) -> Comparison:
 
 def percent(x: float) -> str:
     """Format a share, 0 to 1, as a percentage."""
-    return f"{100 * x:.2f} %"
+    return f"{x:.2%}"
 
 
 def probability(p: float) -> str:
