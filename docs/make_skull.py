@@ -45,7 +45,7 @@ def outlined(path: Path, mask: Path) -> np.ndarray:
 
 
 def cameras(sparse: Path, picture: Path) -> None:
-    """Cameras and points from above and from aside, in the frame of structure from motion."""
+    """Cameras and points from above and from the side, in the frame of structure from motion."""
     model = pycolmap.Reconstruction(sparse)
     images = [image for image in model.images.values() if image.has_pose]
     centres = np.array([image.projection_center() for image in images])
@@ -55,7 +55,7 @@ def cameras(sparse: Path, picture: Path) -> None:
     axes = np.stack([*across, up])
     points = np.array([p.xyz for p in model.points3D.values() if p.track.length() > 3])
     figure, panels = plt.subplots(1, 2, figsize=(10, 4.5))
-    for panel, (i, j), name in zip(panels, ((0, 1), (0, 2)), ("from above", "from aside")):
+    for panel, (i, j), name in zip(panels, ((0, 1), (0, 2)), ("from above", "from the side")):
         panel.scatter(*(points @ axes.T).T[[i, j]], s=0.3, c="0.4")
         panel.scatter(*(centres @ axes.T).T[[i, j]], s=14, c="tab:orange")
         panel.set_aspect("equal")

@@ -124,7 +124,7 @@ def masks_report(found: SegmentedObject, sparse: SparseModel, source: str | Path
     without = [name for name in sparse.cameras if name not in found.masks]
     why = "does not show the object, or not clearly enough for a mask" if source == "auto" else "none was given"
     return "\n".join([
-        f"Masks: of {len(found.masks)} of {len(sparse.cameras)} photographs",
+        f"Masks: {len(found.masks)} of {len(sparse.cameras)} photographs",
         *(f"  without: {name}: {why}" for name in without),
     ])  # fmt: skip
 
@@ -150,8 +150,8 @@ def main(arguments: Sequence[str]) -> None:
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
     if scene.exists() and (sheet.exists() or read_json(config.out / OPTIONS) != config.words()):
-        raise InputError(f"{scene}: DIR: exists already; give another folder, or remove it, with images/, masks/, "
-                         f"valid/ and table.png beside it, to make it again from {config.out}/work")  # fmt: skip
+        raise InputError(f"{config.out}: DIR: has a scene.xml already; give another folder. To make it again, remove "
+                         "scene.xml, images/, masks/, valid/ and table.png there, and keep work/")  # fmt: skip
     try:
         with command.resumable(), locked(config.out, "DIR"), Steps(*(STEPS[-1:] if scene.exists() else STEPS)):
             if not scene.exists():

@@ -45,10 +45,10 @@ def test_a_good_capture_passes(small_capture, tmp_path, capsys):
     assert len(rows) == 12 and {row[-1] for row in rows} <= {"98%", "99%", "100%"}
     sheet = Image.open(tmp_path / "sheet.png")
     assert sheet.width >= 1200
-    red = (np.array(sheet) == [255, 51, 51]).all(-1)
-    assert red.sum() > 12 * 30  # the masks' outlines
+    green = (np.array(sheet) == [60, 255, 60]).all(-1)
+    assert green.sum() > 12 * 30  # the masks' outlines
     cells = np.array(sheet)[400:].astype(int)
-    assert (cells[..., 1] > cells[..., [0, 2]].max(-1) + 60).sum() > 12 * 100  # the hull, green
+    assert (cells == [80, 160, 255]).all(-1).sum() > 30  # the hull, where masks do not hide its outline
 
 
 MATRICES = {

@@ -189,7 +189,7 @@ def test_a_photograph_that_does_not_show_the_object_is_left_out(tmp_path, capsys
     top = {"fl_x": 170, "fl_y": 176, "cx": 77, "cy": 64, "w": 160, "h": 120, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(top))
     photos.main([str(tmp_path), str(tmp_path / "capture")])
-    assert "Masks: of 19 of 20 photographs\n  without: 05: " in capsys.readouterr().out
+    assert "Masks: 19 of 20 photographs\n  without: 05: " in capsys.readouterr().out
     capture = load_capture(tmp_path / "capture/scene.xml")
     assert len(capture) == 19 and "05" not in capture.names
 

@@ -70,7 +70,7 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
     local = camera.to_world[:3, :3].T @ (light - camera.position)
     np.testing.assert_allclose(local, [-0.1, 0.05, 0], atol=1e-5)  # Mitsuba's axes
     assert capture.reflectance(np.zeros(3), capture.exposure()) * np.pi > 1.5  # not known: interreflection is left out
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="DIR: has a scene.xml already"):
         photos.main([str(folder), str(out)])
     (out / "scene.xml").unlink()
     for name in ("images", "masks", "valid"):
@@ -86,7 +86,7 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
         shutil.rmtree(out / name, ignore_errors=True)
     (out / "work/masks/03.png").unlink()  # of no use
     photos.main([str(folder), str(out)])
-    assert "Masks: of 19 of 20 photographs" in (printed := capsys.readouterr().out)
+    assert "Masks: 19 of 20 photographs" in (printed := capsys.readouterr().out)
     assert "Assumed: 20 files of 8 bits are sRGB\n" in printed
     assert len(load_capture(out / "scene.xml")) == 19
     (folder / "07.png").unlink()

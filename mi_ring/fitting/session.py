@@ -224,8 +224,8 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
             print("Interreflection is left out: by the lights' intensities, which must be true for it, the object "
                   f"reflects {model.albedo:.3g} times the light that it gets")  # fmt: skip
         elif model.albedo >= 1 and model.calibration and "scale" in model.calibration.refined:
-            print(f"By the lights' intensities the object reflects {model.albedo:.3g} times the light that it gets: "
-                  "how strong they are is found by interreflection (--refine scale)")  # fmt: skip
+            print(f"With the lights of the scene the object would reflect {model.albedo:.3g} times the light that it "
+                  "gets. The fit finds how strong they really are (--refine scale)")  # fmt: skip
         if processes.count > 1:
             print(f"{processes.count} processes share the points and photographs of each iteration")
         if not fit.iteration:

@@ -14,6 +14,7 @@ from mi_ring.rendering.spherical_harmonics import PER_FRAME, room_envmap
 from mi_ring.scene.assembly import lamp_lights
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
+VISIBLE = 0.01  #: the least shift of a photograph that is drawn [px]
 LISTED = 6  #: unknowns of one kind that are listed one by one
 
 
@@ -112,7 +113,7 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     moved = [entry["moved_px"] for entry in photographs.values()]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
     light = after.photographs.room if after.photographs.dark else None
-    told = max(moved) > 0 or len(power) or light is not None  # otherwise there is no second chart
+    told = max(moved) > VISIBLE or len(power) or light is not None  # otherwise there is no second chart
     figure = Figure(figsize=(9 if told else 4.5, 3.4), layout="constrained")
     plan, *others = figure.subplots(1, 2 if told else 1, squeeze=False)[0]
     up = before.up
@@ -131,7 +132,7 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
             bars.axis("off")
             bars.set_title(f"the environment, by longitude and latitude, y of the {frame} up", fontsize=9)
             continue
-        if max(moved) > 0:
+        if max(moved) > VISIBLE:
             bars.bar(range(len(moved)), moved, color=AFTER)
             bars.set_ylabel("pixels")
             bars.set_title("shift of the object in each photograph", fontsize=9)

@@ -16,10 +16,10 @@ from mi_ring.metrics.surfaces import hits
 from mi_ring.scene.plain_mesh import scene_of
 
 CELL, LINE = 200, 16  # size of a photograph, height of a line of text [px]
-GOOD, DOUBTED = (255, 255, 255), (255, 90, 90)  # colours of the photographs' names
-RED, YELLOW, GREEN = (255, 51, 51), (255, 220, 40), (26, 255, 51)
+GOOD, DOUBTED = (255, 255, 255), (255, 220, 40)  # colours of the photographs' names
+GREEN, RED, BLUE = (60, 255, 60), (255, 60, 60), (80, 160, 255)
 LEGEND = (
-    ("mask", RED), ("not used: unsure, or outside the lens", YELLOW), ("hull of all masks", GREEN),
+    ("mask", GREEN), ("uncertain, or outside the lens", RED), ("hull of all masks", BLUE),
     ("share of the mask that the other masks agree with", GOOD), ("too small", DOUBTED),
 )  # fmt: skip
 
@@ -76,13 +76,12 @@ def capture_sheet(capture: Capture, rows: list[PhotographQuality], center: np.nd
         scale = max(1, max(capture.shots[k].size) // CELL)
         observed, _, mask, masked, valid = capture.observe([k], scale)
         picture = linear_to_srgb(observed[0].numpy() / white)
-        if hull:
-            seen = hits(hull, capture.photograph(k, scale))[0].reshape(picture.shape[:2])
-            picture = 0.7 * picture + 0.3 * seen[..., None] * np.divide(GREEN, 255)
-        outlined = [(mask[0].numpy() > 0.5, RED)] if masked else []
-        outlined += [(~valid[0].numpy(), YELLOW)] if valid is not None else []
+        outlined = [(~valid[0].numpy(), RED)] if valid is not None else []
+        outlined += [(hits(hull, capture.photograph(k, scale))[0].reshape(mask[0].shape), BLUE)] if hull else []
+        outlined += [(mask[0].numpy() > 0.5, GREEN)] if masked else []
         for inside, colour in outlined:
-            picture[inside & ~ndimage.binary_erosion(inside)] = np.divide(colour, 255)
+            edge = inside & ~ndimage.binary_erosion(inside, border_value=1)
+            picture[edge] = np.divide(colour, 255)
         cell = Image.fromarray(to_bytes(picture))
         cell.thumbnail((CELL, CELL))
         x, y = place % columns * CELL, above + place // columns * (CELL + LINE)

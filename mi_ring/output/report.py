@@ -159,13 +159,13 @@ def fit_findings(
         scatter = np.hypot(*scatter)
         pixel = float(np.median([row.pixel for row in rows]))
         if np.hypot(*shift) > max(ALL_SHIFTED * pixel, 3 * scatter / math.sqrt(len(shifts))):
-            found.append(f"The photographs are {sides(*shift)} of their predictions, in the median: cameras (cx and cy "
-                         "or to_world) or masks seem off by this shift or more. Measured cameras need the first "
-                         "pixel's centre at (0.5, 0.5); correct others with --refine auto cameras.")  # fmt: skip
+            found.append(f"The photographs are shifted against their predictions, {sides(*shift)} (median): masks or "
+                         "cameras may be wrong. If cameras were measured, check cx and cy: the first pixel's centre is "
+                         "at (0.5, 0.5). Otherwise try --refine auto cameras.")  # fmt: skip
         away = [(name, np.subtract(by, shift)) for name, by in shifts]
         limit = max(SHIFTED * pixel, 3 * scatter)
         if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):
-            found.append(f"{few} of the prediction, unlike the others; correct the pose, or leave the "
+            found.append(f"{few}: shifted against the prediction, unlike the others; correct the pose, or leave the "
                          "photograph out.")  # fmt: skip
     if refined and (few := moved_far(refined["photographs"])):
         found.append(f"{few}: the fit has moved the camera much farther than the others': out of focus, or another "
@@ -194,9 +194,12 @@ def worst(photographs: Iterable[tuple[float, str, str]], most: int = 5) -> str:
 def sides(x: float, y: float) -> str:
     """Describe a shift of (`x`, `y`) pixels as text, for example "1.0 px to the right and 2.0 px above".
 
-    A positive `x` is a shift to the right, a positive `y` is a shift downward.
+    A positive `x` is a shift to the right, a positive `y` is a shift downward. A shift that rounds to 0.0 is left out.
     """
-    return f"{abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px {'below' if y > 0 else 'above'}"
+    parts = [(x, "to the right" if x > 0 else "to the left"), (y, "below" if y > 0 else "above")]
+    return " and ".join(
+        f"{abs(by):.1f} px {where}" for by, where in parts if abs(by) >= 0.05 or by == max(x, y, key=abs)
+    )
 
 
 class PredictedPhotograph(NamedTuple):
