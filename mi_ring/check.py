@@ -12,7 +12,7 @@ from mi_ring.capture.reduction import WIDTH
 from mi_ring.errors import InputError
 from mi_ring.output.inspection import inspect
 from mi_ring.system import command, files
-from mi_ring.system.progress import Step, Steps
+from mi_ring.system.progress import Part, Steps
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     config = command.parse(CheckConfig, arguments, "mi_ring.check")
     out = config.out or Path("out/check") / f"{command.scene_name(config.scene)}.png"
-    with Steps(Step(("reading masks", "searching"), 1), Step(("reading",), 5), Step(("inspecting",), 4)):
+    with Steps([Part("reading masks", 0.5), Part("searching", 0.5)], [Part("reading", 5)], [Part("inspecting", 4)]):
         return checked(config, out)
 
 

@@ -1,6 +1,8 @@
 """Make a capture from a folder of photographs: `python -m mi_ring.photos FOLDER DIR`."""
 
+import contextlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Sequence
@@ -16,7 +18,7 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.capture.reduction import WIDTH
 from mi_ring.capture.scenefile import room_element, scene_bytes, scene_element
 from mi_ring.errors import InputError
-from mi_ring.image_headers import encodings
+from mi_ring.image_headers import SUFFIXES, encodings, image_size
 from mi_ring.importers.formats import detect
 from mi_ring.importers.writer import Writer
 from mi_ring.output.inspection import inspect
@@ -32,19 +34,10 @@ from mi_ring.system import command
 from mi_ring.system.files import locked, read_json, write_file
 from mi_ring.system.machine import in_threads
 from mi_ring.system.optional import need
-from mi_ring.system.progress import Step, Steps, progress
+from mi_ring.system.progress import Part, Steps, progress
 
 OPTIONS = "work/options.json"  #: the options of the command that made the capture
 METRES = 1e-3  #: length of a scene unit if there is a sheet [m]
-
-
-#: of the command, with seconds as measured for each of 80 photographs of 13 megapixels
-STEPS = (
-    Step(("sheet",), 0.1), Step(("features",), 1.0), Step(("matching",), 2.4),
-    Step(("cameras", "all cameras", "bundle adjustment", "principal points"), 3.1),
-    Step(("reading", "masks", "bare table", "a trial fit", "table"), 2.7), Step(("writing",), 0.3),
-    Step(("reading", "inspecting"), 0.4),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -144,6 +137,35 @@ def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedO
             f"{share:.1%} of its light at the object{curve}")  # fmt: skip
 
 
+def steps_of(pictures: Path) -> list[list[Part]]:
+    """List the steps of the command, with seconds that fit to measurements: see `docs/background/performance.md`.
+
+    `pictures`: folder of the photographs. 58 photographs of 0.8 megapixels and 80 of 13 megapixels were measured.
+    """
+    files = [file for file in sorted(pictures.glob("[!.]*")) if file.suffix.lower() in SUFFIXES] if pictures else []
+    count, size = max(3, len(files)), 1e6
+    with contextlib.suppress(Exception):  # the command itself says what is wrong
+        size = math.prod(image_size(files[0]))
+    millions = min(size, 20e6) / 1e6
+    pairs = min(count * (count - 1) / 2, 21 * count)
+    outlines = 0.4 + 0.05 * millions
+    sometimes = [Part(name, 0) for name in ("bare table", "a trial fit", "table", "beside the table", "pattern")]
+    return [
+        [Part("sheet", 0.01 * count * millions)],
+        [Part("features", count * (0.35 + 0.05 * millions))],
+        [Part("matching", pairs * (0.03 + 0.006 * millions))],
+        [Part("all cameras", count * (0.17 + 0.1 * millions)), Part("cameras", count * (0.1 + 0.1 * millions)),
+         Part("bundle adjustment", 0.04 * count), Part("principal points", 0.02 * count)],
+        [Part("reading", count * 0.04 * (1 + millions)),
+         *(Part(f"masks, the object's place, round {k}", 0.13 * count) for k in (1, 2, 3, 4)),
+         Part("masks, the object's place", 0), *sometimes, Part("reading", 0.05 * count),
+         *(Part(f"masks, openings, round {k}", 0.1 * count) for k in (1, 2)),
+         *sometimes, *(Part(f"masks, outlines, round {k}", outlines * count) for k in (1, 2))],
+        [Part("writing", count * (0.05 + 0.03 * millions))],
+        [Part("reading", count * 0.02 * (1 + millions)), Part("inspecting", 0.2 * count)],
+    ]  # fmt: skip
+
+
 def main(arguments: Sequence[str]) -> None:
     """Run the command with these arguments of the command line."""
     config = command.parse(PhotosConfig, arguments, "mi_ring.photos")
@@ -153,7 +175,11 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"{config.out}: DIR: has a scene.xml already; give another folder. To make it again, remove "
                          "scene.xml, images/, masks/, valid/ and table.png there, and keep work/")  # fmt: skip
     try:
-        with command.resumable(), locked(config.out, "DIR"), Steps(*(STEPS[-1:] if scene.exists() else STEPS)):
+        with (
+            command.resumable(),
+            locked(config.out, "DIR"),
+            Steps(*steps_of(config.folder)[-1 if scene.exists() else 0 :]),
+        ):
             if not scene.exists():
                 make(config, scene)
             inspection = inspect(load_capture(scene, width=WIDTH))

@@ -410,7 +410,9 @@ def test_a_moved_principal_point_is_found_and_nothing_else_is(fitted, broken_cap
     wrong = replace(fitted, capture=load_capture(path))
     moved = [panel(wrong, k) for k in range(12)]
     found = [found for found in report.fit_findings(moved, 50, 50) if "cx and cy" in found]
-    assert len(found) == 1 and re.search(r"(1\.[5-9]|2\.[0-5]) px to the left( and 0\.[0-2] px \w+)? \(median\)", found[0])
+    assert len(found) == 1 and re.search(
+        r"(1\.[5-9]|2\.[0-5]) px to the left( and 0\.[0-2] px \w+)? \(median\)", found[0]
+    )
 
 
 def test_saturated_pixels_are_counted_on_the_object(broken_capture, fitted):

@@ -7,15 +7,15 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 from tqdm import tqdm
 
 Progress = Callable[..., Iterable]  #: the type of `progress`, and of substitutes that show nothing
 DELAY, LOG_INTERVAL = 2.0, 30.0  #: seconds before the first line in a log, and between two lines
-KNOWN = 0.1  #: share of the work of all steps whose time tells how long the rest will take
-BEGUN = 0.05  #: share of a bar that tells how long the rest of it will take
+KNOWN = 0.1  #: share of the work whose time tells how long the rest will take
+WITHIN_STEPS = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}"  #: a bar without a time of its own
 
 
 @contextlib.contextmanager
@@ -80,15 +80,11 @@ class Bar(tqdm):
     def format_dict(self) -> dict[str, Any]:
         """The values that tqdm writes. Their prefix has the time that all steps still need."""
         values = super().format_dict
-        if Steps.current and (left := Steps.current.left(self.seconds_left(values))) is not None:
-            values["prefix"] = f"{values['prefix'].removesuffix(': ')}, all done in {rounded_time(left)}"
+        if Steps.current and values["prefix"].startswith("step "):
+            share = min(1.0, values["n"] / values["total"]) if values["total"] else 0.0
+            if (left := Steps.current.left(share)) is not None:
+                values["prefix"] = f"{values['prefix'].removesuffix(': ')}, all done in {rounded_time(left)}"
         return values
-
-    @staticmethod
-    def seconds_left(values: dict[str, Any]) -> float | None:
-        """Estimate the seconds that the bar itself still needs, from tqdm's `values`. None: too early to tell."""
-        n, total, elapsed = values["n"], values["total"], values["elapsed"]
-        return elapsed * (total - n) / n if total and n >= BEGUN * total and elapsed >= DELAY else None
 
 
 def rounded_time(seconds: float) -> str:
@@ -123,21 +119,26 @@ class LogBar(Bar):
         super().close()
 
 
-class Step(NamedTuple):
-    """A step of a command: the progress bars that belong to it, and how long it is likely to take."""
+class Part(NamedTuple):
+    """A part of a step of a command: one progress bar, and how long it is likely to take."""
 
-    bars: tuple[str, ...]  #: what the names of its progress bars begin with
-    seconds: float  #: that it is likely to take; only the ratios of steps matter
+    name: str  #: what the name of the progress bar begins with
+    seconds: float  #: that it is likely to take; only the ratios of parts matter
 
 
 class Steps:
-    """The steps of a command, as a context manager. In it, progress bars show the step and the time that is left."""
+    """The steps of a command, as a context manager. In it, progress bars show the step and the time that is left.
+
+    Each step is a sequence of parts, in their order. Parts may be left out.
+    """
 
     current: ClassVar["Steps | None"] = None  #: those of the command that runs
 
-    def __init__(self, *steps: Step) -> None:
-        self.steps, self.number, self.started = steps, 0, time.monotonic()
-        self.before = 0.0  # seconds that the steps before the present one took
+    def __init__(self, *steps: Sequence[Part]) -> None:
+        self.count = len(steps)
+        self.parts = [(number, part) for number, step in enumerate(steps, 1) for part in step]
+        self.place, self.started = -1, time.monotonic()
+        self.done = self.before = 0.0  # of the finished parts: expected seconds, true seconds
 
     def __enter__(self) -> "Steps":
         Steps.current = self
@@ -149,30 +150,34 @@ class Steps:
     def named(self, what: str) -> str:
         """Return the text for a progress bar: its name `what` with the number of its step.
 
-        If no step that is left has a bar of this name, returns `what` unchanged.
+        If no part that is left has this name, returns `what` unchanged.
         """
-        ahead = range(self.number, len(self.steps))
-        found = next((n for n in ahead if what.startswith(self.steps[n].bars)), None)
+        ahead = range(max(0, self.place), len(self.parts))
+        found = next((k for k in ahead if what.startswith(self.parts[k][1].name)), None)
         if found is None:
             return what
-        if found > self.number:
-            self.number, self.before = found, time.monotonic() - self.started
-        return f"step {found + 1}/{len(self.steps)}, {what}"
+        if found != self.place:
+            if self.place >= 0:
+                self.done += self.parts[self.place][1].seconds
+            self.place, self.before = found, time.monotonic() - self.started
+        return f"step {self.parts[found][0]}/{self.count}, {what}"
 
-    def left(self, bar_left: float | None) -> float | None:
+    def left(self, share: float) -> float | None:
         """Estimate the seconds that all steps still need together. Returns None if too little is done to tell.
 
-        `bar_left`: seconds that the present bar still needs; None: unknown.
+        `share`: how much of the present part is done, 0 to 1. At its beginning, the time of the part is expected from
+        the parts before; the more of it is done, the more its own speed counts.
         """
-        done = sum(step.seconds for step in self.steps[: self.number])
-        here, total = self.steps[self.number].seconds, sum(step.seconds for step in self.steps)
-        elapsed = time.monotonic() - self.started
-        slowness = []  # seconds here for each second that was measured
-        if done > KNOWN * total:
-            slowness.append(self.before / done)
-        if bar_left is not None and done + here > KNOWN * total:
-            slowness.append((elapsed + bar_left) / (done + here))
-        return max(max(slowness) * total - elapsed, bar_left or 0.0) if slowness else None
+        here = self.parts[max(0, self.place)][1].seconds
+        ahead = sum(part.seconds for _, part in self.parts[self.place + 1 :])
+        passed = time.monotonic() - self.started - self.before  # in this part
+        if self.done > KNOWN * (self.done + here + ahead):
+            total = passed + (1 - share) * here * self.before / self.done
+        elif share >= KNOWN:
+            total = passed / share
+        else:
+            return None
+        return (1 - share) * total + ahead * (self.before + total) / (self.done + here)
 
 
 def progress(
@@ -184,7 +189,9 @@ def progress(
     finished. `options`: other options of tqdm. If standard error is not a terminal, it writes a line every 30 seconds,
     and none if the work takes less than two seconds.
     """
-    kind, what = Bar, Steps.current.named(what) if Steps.current else what
+    kind = Bar
+    if Steps.current:
+        what, options = Steps.current.named(what), {"bar_format": WITHIN_STEPS} | options
     if not getattr(sys.stderr, "isatty", bool)():
         kind = LogBar
         # At position 0, tqdm would end with a carriage return.
