@@ -1,5 +1,6 @@
 """Details: grids that are added to the networks."""
 
+import copy
 import dataclasses
 import math
 
@@ -315,6 +316,46 @@ def test_folds_are_smoothed_and_nothing_else():
     assert (values == gentle)[:, 0].float().mean() > 0.9
 
 
+def test_no_fold_is_left_and_smoothing_again_changes_nothing():
+    for seed in (1, 2):
+        ring = small()
+        add_detail(ring, 4, 20)
+        for values in ring.shape_net.grid.values:
+            values.data = 30 * torch.randn(values.shape, generator=torch.Generator().manual_seed(seed))
+        unfold(ring, 4)
+        assert least_cosine(ring) >= 0.2 - 1e-5
+        before = [values.detach().clone() for values in ring.shape_net.grid.values]
+        unfold(ring, 4)
+        assert all(torch.equal(a, b) for a, b in zip(before, ring.shape_net.grid.values))
+
+
+def test_points_and_networks_that_change_in_place_are_noticed():
+    ring, s = small(), points_near()
+    add_detail(ring, 4, 20)
+    for grid in (ring.shape_net.grid, ring.brdf_net.grid):
+        for values in grid.values:
+            values.data = torch.randn(values.shape, generator=torch.Generator().manual_seed(8))
+
+    def current():
+        return torch.equal(ring.surface(s), ring.surface(s.clone())) and all(
+            torch.equal(a, b) for a, b in zip(ring.material(s).values(), ring.material(s.clone()).values())
+        )
+
+    ring(s)
+    s *= -1
+    assert current()
+    ring(s)
+    with torch.no_grad():
+        for parameter in [*ring.shape_net.base.parameters(), *ring.brdf_net.base.parameters()]:
+            parameter += 0.01
+    assert current()
+    elsewhere = ring_state(ring)["networks"]
+    elsewhere = {name: v + 2**43 if ".keys" in name else v.clone() for name, v in elsewhere.items()}
+    ring(s)
+    ring.load_state_dict(elsewhere)
+    assert current()
+
+
 def test_details_come_last_and_only_if_photographs_can_agree():
     stages = Schedule.of(Config(iterations=100, detail_share=0.31), settling=True, detail=[6, 7]).stages
     assert [stage.detail for stage in stages[-3:]] == [False, True, True]
@@ -389,3 +430,17 @@ def test_details_that_do_not_help_are_removed(small_capture):
     fit.step()
     assert "detail" in fit.course.validation["put_back"]
     assert fit.ring.shape_net is smooth
+    again = Fit(load_capture(small_capture), fit.problem.config, state=fit.state())
+    assert again.iteration == again.iterations
+    s = points_near()
+    assert torch.equal(again.ring.surface(s), fit.ring.surface(s))
+
+
+def test_a_state_that_has_details_of_one_network_alone_is_refused(detailed, small_capture):
+    state = copy.deepcopy(detailed[1][31])
+    ring = state["ring"]
+    ring["brdf_net"] = ring["brdf_net"]["arguments"]["net"]
+    tensors = {name: value for name, value in ring["networks"].items() if not name.startswith("brdf_net.grid")}
+    ring["networks"] = {name.replace("brdf_net.base.network.", "brdf_net."): value for name, value in tensors.items()}
+    with pytest.raises(InputError, match="state: is of a fit with other settings"):
+        Fit(load_capture(small_capture), SMALL, state=state)

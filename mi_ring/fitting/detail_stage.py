@@ -75,7 +75,8 @@ def share_weights(ring: FittedObject) -> None:
 def unfold(ring: FittedObject, level: int) -> None:
     """Reduce displacements, in place, where they turn triangles of the mesh at `level` by about 80 degrees or more.
 
-    The displacements around such a triangle are halved, eight times at most. The last time they become 0.
+    The displacements around such a triangle are halved, seven times at most. After that they become 0. A second call
+    changes nothing.
     """
     s, faces = ring.domain.sample(level)
     s = s.to(ring.center.device)
@@ -87,12 +88,13 @@ def unfold(ring: FittedObject, level: int) -> None:
         return torch.nn.functional.normalize(area_vectors(points, corners), dim=1)
 
     smooth = normals(flow.base(s, 1.0))
-    for k in range(HALVINGS):
+    changed, rounds = True, 0
+    while changed:
         folded = (normals(flow(s)) * smooth).sum(1) < STEEPEST
-        if not folded.any():
-            return
         around = torch.zeros(len(s))
         around[corners[folded].cpu().ravel()] = 1
+        changed, rounds = False, rounds + 1
         for values, weights in zip(flow.grid.values, flow.grid.weights(s)):
             near = torch.from_numpy(weights.T @ around.numpy() > 0).to(values.device)
-            values[near] *= 0 if k == HALVINGS - 1 else 0.5
+            changed = changed or bool(values[near].any())
+            values[near] *= 0.5 if rounds < HALVINGS else 0

@@ -53,7 +53,7 @@ class Model(nn.Module):
     @property
     def detailed(self) -> bool:
         """Return True if details have been added to the networks."""
-        return isinstance(self.ring.shape_net, DetailedFlow)
+        return isinstance(self.ring.shape_net, DetailedFlow) and isinstance(self.ring.brdf_net, DetailedMaterial)
 
     def add_detail(self, level: int) -> None:
         """Add details, which are 0, to both networks, and freeze the networks. `level`: level of the finest mesh."""

@@ -191,6 +191,8 @@ class Optimisation:
 
     def state(self) -> dict[str, Any]:
         """Return the states of the optimisers and of the guard, for a checkpoint."""
+        if not self.model.detailed and isinstance(self.optimizers[0], AgreeingAdam):
+            self.begin()  # details were removed at the end: a fit that continues has the optimisers of networks
         return {"optimizers": [o.state_dict() for o in self.optimizers], "guard": self.guard.state()}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -41,7 +41,8 @@ class Grid(nn.Module):
         for k, n in enumerate(nodes):
             self.register_buffer(f"keys{k}", torch.zeros(n, dtype=torch.long))
         self.values = nn.ParameterList(nn.Parameter(torch.zeros(n, channels)) for n in nodes)
-        self.latest: list[tuple[Tensor, list[scipy.sparse.csr_matrix]]] = []  #: the last points, and their weights
+        #: the last points, their stamp, and their weights
+        self.latest: list[tuple[Tensor, tuple, list[scipy.sparse.csr_matrix]]] = []
 
     @classmethod
     def around(cls, points: Tensor, cell: float, octaves: int, channels: int) -> "Grid":
@@ -75,8 +76,8 @@ class Grid(nn.Module):
 
         The eight corners around a point have weights above 0. A corner without a value has none.
         """
-        for points, weights in self.latest:
-            if same(points, s):
+        for _, known, weights in self.latest:
+            if known == stamp(s):
                 return weights
         self.latest.clear()
         rows, found = np.arange(0, 8 * len(s) + 1, 8, dtype=np.int32), []
@@ -84,7 +85,7 @@ class Grid(nn.Module):
             parts = [self.octave_weights(part, k) for part in s.detach().cpu().split(AT_ONCE)]
             weight, node = (torch.cat(part).numpy().ravel() for part in zip(*parts))
             found.append(scipy.sparse.csr_matrix((weight, node, rows), (len(s), len(self.keys(k)))))
-        self.latest.append((s.detach(), found))
+        self.latest.append((s.detach(), stamp(s), found))
         release_memory()  # of intermediate results, which take more than the weights
         return found
 
@@ -92,6 +93,10 @@ class Grid(nn.Module):
         """Use the same memory for weights as `other`, if it has the same corners."""
         if self.cells == other.cells and all(torch.equal(self.keys(k), other.keys(k)) for k in range(len(self.cells))):
             self.latest = other.latest
+
+    def _load_from_state_dict(self, *arguments: Any) -> None:
+        super()._load_from_state_dict(*arguments)
+        self.latest.clear()  # weights for other corners
 
     def octave_weights(self, s: Tensor, octave: int) -> tuple[Tensor, Tensor]:
         """Compute the weights (V, 8) of the corners around points (V, 3), and their places (V, 8) among the values."""
@@ -124,9 +129,12 @@ class _Product(torch.autograd.Function):
         return torch.from_numpy(ctx.matrix.T @ gradient.numpy(force=True)).to(gradient.device), None
 
 
-def same(a: Tensor, b: Tensor) -> bool:
-    """Return True if two tensors are the same memory, so that results for one are valid for the other."""
-    return a.data_ptr() == b.data_ptr() and a.shape == b.shape
+def stamp(*tensors: Tensor) -> tuple:
+    """Return a value that stays the same until one of the tensors is another one or is changed in place.
+
+    Another tensor may get the memory of one that is gone. So keep them as long as the stamp.
+    """
+    return tuple((t.data_ptr(), t.shape, 0 if t.is_inference() else t._version) for t in tensors)
 
 
 def keys_of(cubes: Tensor) -> Tensor:
@@ -145,17 +153,17 @@ class Remembered(nn.Module):
         super().__init__()
         self.network: Any = network.requires_grad_(False)
         self.method = method
-        self.last: tuple[Tensor, tuple[float, ...], Tensor] | None = None  #: points, further arguments, result
+        self.last: tuple[Tensor, tuple, Tensor] | None = None  #: points, stamp and further arguments, result
 
     def forward(self, s: Tensor, *more: float) -> Tensor:
         """Return what the network's method returns for points (V, 3) and further arguments.
 
-        If they are those of the last call, this is the result of the last call.
+        If they and the network are those of the last call, this is the result of the last call.
         """
-        last = self.last
-        if last is None or not same(last[0], s) or last[1] != more:
+        last, asked = self.last, (stamp(s, *self.network.parameters(), *self.network.buffers()), more)
+        if last is None or last[1] != asked:
             with torch.no_grad(), torch.autocast(s.device.type, enabled=False):
-                self.last = last = s.detach(), more, getattr(self.network, self.method)(s, *more)
+                self.last = last = s.detach(), asked, getattr(self.network, self.method)(s, *more)
         return last[2]
 
 
