@@ -176,7 +176,8 @@ class Fit(Renamed):
         """
         result = result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
                            list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
-        if self.iteration == self.iterations and self.schedule.details:
+        detailed = self.schedule.stages[-1].detail and self.problem.config.detail in ("texture", "both")
+        if detailed and self.iteration == self.iterations:
             try:
                 sharpen(self.capture, result.capture, self.ring, self.problem.fitted, result.width)
             except InputError as error:  # a file has gone: all else is saved
