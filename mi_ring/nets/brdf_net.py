@@ -79,6 +79,13 @@ class MaterialNet(nn.Module):
                 result[parameter.name] = parameter.low + (parameter.high - parameter.low) * torch.sigmoid(x)
         return result
 
+    def fine(self, s: Tensor) -> dict[str, Tensor]:
+        """Compute the parameters at domain points (..., 3) that are texels, closer to each other than any vertices.
+
+        The result is that of a call, unless the material has a texture that is too fine for vertices.
+        """
+        return self(s)
+
 
 @register_network("brdfnet")
 class BRDFNet(MLP, MaterialNet):

@@ -91,8 +91,15 @@ class TransferredMaterial(MaterialNet):
         self.net, self.here, self.there = net, here, there
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
+        return self.net(self.corresponding(s))
+
+    def fine(self, s: Tensor) -> dict[str, Tensor]:
+        return self.net.fine(self.corresponding(s))
+
+    def corresponding(self, s: Tensor) -> Tensor:
+        """Return the points (..., 3) of the other domain that correspond to points (..., 3) of this one."""
         points = self.there.to_domain(self.here.to_sphere(s.detach().reshape(-1, 3).cpu().numpy()))
-        return self.net(torch.from_numpy(points).to(s).reshape(s.shape))
+        return torch.from_numpy(points).to(s).reshape(s.shape)
 
 
 class EditedMaterial(MaterialNet):
@@ -106,7 +113,13 @@ class EditedMaterial(MaterialNet):
         self.net, self.gains, self.offsets = net, gains, offsets
 
     def forward(self, s: Tensor) -> dict[str, Tensor]:
-        values = self.net(s)
+        return self.edited(self.net(s))
+
+    def fine(self, s: Tensor) -> dict[str, Tensor]:
+        return self.edited(self.net.fine(s))
+
+    def edited(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Apply gains and offsets to parameters, in place. Returns them."""
         for p in self.bsdf_parameters:
             gain = values[p.name].new_tensor(self.gains.get(p.name, 1.0))
             value = gain * values[p.name] + self.offsets.get(p.name, 0.0)

@@ -14,7 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.nets import resnet  # noqa: F401  (registers it)
 from mi_ring.nets.registry import architecture_of, build
-from mi_ring.objects import detail
+from mi_ring.objects import detail, sharpened_material  # noqa: F401  (registers it)
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.files import is_sealed
 from mi_ring.version import __version__
@@ -62,7 +62,9 @@ def ring_of(state: dict) -> FittedObject:
     domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
     for name in ("shape_net", "brdf_net"):
         require_grid(state["networks"], name, state[name])
-    material = state["brdf_net"]["arguments"].get("net", state["brdf_net"])  # without details
+    material = state["brdf_net"]
+    while "net" in material["arguments"]:  # without details and texture
+        material = material["arguments"]["net"]
     for parameter in material["arguments"].get("parameters", ()):
         require(parameter[1] in (1, 3), f"{parameter[0]} has {parameter[1]} channels")
     ring = FittedObject(
@@ -93,7 +95,9 @@ def require_grid(networks: dict, name: str, architecture: dict) -> None:
 
     `networks`: tensors of the file by name. `name`: "shape_net" or "brdf_net". `architecture`: its description.
     """
-    if architecture["name"] in ("detailed-flow", "detailed-material"):
+    if architecture["name"] == "sharpened-material":
+        require_grid(networks, f"{name}.base", architecture["arguments"]["net"])
+    if architecture["name"] in ("detailed-flow", "detailed-material", "sharpened-material"):
         grid, start = architecture["arguments"]["grid"], f"{name}.grid."
         nodes = [len(value) for key, value in networks.items() if key.startswith(f"{start}keys")]
         found = nodes, networks[f"{start}values.0"].shape[1]
@@ -120,6 +124,8 @@ def require_valid(ring: FittedObject) -> None:
     for grid in [part for part in ring.modules() if isinstance(part, detail.Grid)]:
         octaves = range(len(grid.cells))
         require(all(bool((grid.keys(k).diff() > 0).all()) for k in octaves), "details are not in order")
+        if len(octaves) == 1:  # a texture has only what is seen
+            continue
         for k in octaves[:2]:  # the coarsest cubes may be around all of the domain; the finest may miss some vertices
             inside = grid.octave_weights(torch.from_numpy(points), k)[0].sum(1) > 0.5
             require(bool(inside.float().mean() > 0.5), "details are elsewhere than the domain")

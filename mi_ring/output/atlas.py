@@ -174,11 +174,11 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
 
 
 def reflectances(ring: FittedObject, s: np.ndarray) -> dict[str, np.ndarray]:
-    """Evaluate the material network at points `s` (N, 3) of the domain.
+    """Evaluate the material network at points `s` (N, 3) of the domain, with its finest texture.
 
     Returns the BSDF parameters as arrays (N, 3) or (N,), with the parameters' names as keys.
     """
     with torch.no_grad():
         chunks = torch.from_numpy(s).to(ring.center.device).split(CHUNK)
-        parts = [ring.material(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]
+        parts = [ring.brdf_net.fine(chunk) for chunk in progress(chunks, "baking", disable=len(chunks) < 3 or None)]
     return {name: torch.cat([part[name] for part in parts]).cpu().numpy() for name in parts[0]}

@@ -56,18 +56,24 @@ class Visibility:
         """
         points, normals = np.asarray(points, float), np.asarray(normals, float)  # trimesh has arrays of its own
         seen = np.zeros(len(points), bool)
-        start = (points - self.center) / self.size + SURFACE_OFFSET * normals
         for view in self.views:
-            eye = view.camera.position - points
-            lanes = np.flatnonzero(~seen & ((normals * eye).sum(1) > 0))
-            lanes = lanes[in_picture(view, points[lanes])]
-            if not len(lanes):  # Dr.Jit traces no empty arrays
-                continue
-            along = (view.camera.position - self.center) / self.size - start[lanes]
-            distance = np.linalg.norm(along, axis=1, keepdims=True)
-            ray = mi.Ray3f(mi.Point3f(to_vectors(start[lanes])), to_vectors(along / distance))
-            ray.maxt = to_flat(mi.Float, distance)
-            seen[lanes] = ~np.array(self.scene.ray_test(ray))
+            unseen = np.flatnonzero(~seen)
+            seen[unseen] = self.seen_by(view, points[unseen], normals[unseen])
+        return seen
+
+    def seen_by(self, view: MaskedCamera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Test points (N, 3) [scene units] with unit normals (N, 3) for one camera. Returns (N,) bool."""
+        seen = np.zeros(len(points), bool)
+        lanes = np.flatnonzero((normals * (view.camera.position - points)).sum(1) > 0)
+        lanes = lanes[in_picture(view, points[lanes])]
+        if not len(lanes):  # Dr.Jit traces no empty arrays
+            return seen
+        start = (points[lanes] - self.center) / self.size + SURFACE_OFFSET * normals[lanes]
+        along = (view.camera.position - self.center) / self.size - start
+        distance = np.linalg.norm(along, axis=1, keepdims=True)
+        ray = mi.Ray3f(mi.Point3f(to_vectors(start)), to_vectors(along / distance))
+        ray.maxt = to_flat(mi.Float, distance)
+        seen[lanes] = ~np.array(self.scene.ray_test(ray))
         return seen
 
 

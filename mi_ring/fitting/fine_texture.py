@@ -1,0 +1,255 @@
+"""Colours finer than the photographs of the fit, from the photographs at their own size.
+
+After a fit, surface, light and material are known. The photographs may be larger than the fit has seen them. The ratio
+of such a photograph to its prediction, without highlights, is what the fitted colours lack. Each point of the surface
+gets the mean ratio of the photographs that show it, as in the texture mapping of photogrammetry. Shading is divided
+out, so the colours stay free of light. Coarse differences are left out: they are errors of light or shape.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+from scipy import ndimage
+
+from mi_ring.capture.capture import Capture
+from mi_ring.capture.decoding import read_photograph
+from mi_ring.capture.observation import observed
+from mi_ring.capture.reduction import reduced_image, windowed
+from mi_ring.geometry.meshes import area_vectors
+from mi_ring.nets.registry import is_registered
+from mi_ring.objects.detail import AT_ONCE, Grid
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.sharpened_material import SharpenedMaterial
+from mi_ring.rendering import prediction
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
+from mi_ring.scene.shot import Shot
+from mi_ring.scene.visibility import MaskedCamera, Visibility
+from mi_ring.system.progress import progress
+
+WIDEST = 2048  #: to which photographs are reduced for the texture [px]
+WORTH = 1.3  #: the photographs must be wider than those of the fit by this factor
+CELL, SOLVING = 1.0, 4  #: side of the cubes of the texture [px]; steps to find the values of their corners
+COARSE = 8.0  #: differences that are coarser than this are left out [px of the fit]
+MOST_POINTS = 6_000_000
+DARK, GLOSSY = 0.03, 0.5  #: least prediction [median of the object], and largest share of highlights in it
+LARGEST = 1.5  #: largest change of a colour, as a logarithm
+SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
+SPECULAR = "specular", "specular_reflectance"  #: names of the parameter of highlights
+CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have in common
+
+
+def texture_width(given: Capture, fitted: Sequence[int], width: int) -> int:
+    """Choose the width to which photographs are reduced for the texture [px]. Returns 0 if it would not be finer.
+
+    `given`: the capture of the fit, which may be reduced. `fitted`: indices of its photographs that are fitted.
+    `width`: of the photographs in the last stage of the fit [px].
+    """
+    extents = [shot.window.extent[0] if shot.window else shot.size[0]
+               for shot in (given.shots[k] for k in fitted) if shot.files.filename]  # fmt: skip
+    widest = min(WIDEST, max(extents, default=0))
+    return widest if widest >= WORTH * width else 0
+
+
+def at_width(given: Shot, refined: Shot, width: int) -> tuple[Shot, Shot]:
+    """Return a photograph of the fit at another width: (with the given calibration, with the refined one).
+
+    Both show what the photograph of the fit shows. `width`: the largest width [px].
+    """
+    whole = given.whole
+    window = given.window or windowed(whole.size, (0, 0), whole.size, width)
+    window = windowed(window.whole, window.corner, window.extent, width)
+    return whole.through(window), refined.whole.through(window)
+
+
+class Ratios:
+    """Means of the logarithms of ratios at N points of the surface, from each half of the photographs.
+
+    `number`: N.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.sums, self.weights = np.zeros((2, number, 3), np.float32), np.zeros((2, number), np.float32)
+
+    def add(self, half: int, points: np.ndarray, logarithms: np.ndarray, weights: np.ndarray) -> None:
+        """Add what a photograph shows. `points` (M,): indices. `logarithms` (M, 3). `weights` (M,)."""
+        self.sums[half, points] += logarithms * weights[:, None]
+        self.weights[half, points] += weights
+
+    def means(self) -> np.ndarray:
+        """Return the mean (2, N, 3) of each half; 0 without photographs."""
+        return self.sums / np.maximum(self.weights, 1e-9)[..., None]
+
+
+def ratio_picture(
+    surface: Surface, ring: FittedObject, s: torch.Tensor, given: tuple[Capture, Shot], refined: tuple[Capture, Shot]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compare a photograph with its prediction. Returns (logarithms of ratios (H, W, 3), which are usable (H, W)).
+
+    `surface`: in which the object is rendered. `s`: domain points of its vertices. `given`, `refined`: capture and
+    photograph before and after the calibration by the fit.
+    """
+    (before, own), (capture, shot) = given, refined
+    assert own.window
+    image = reduced_image(own.whole, partial(read_photograph, own.whole, before.path), own.window)
+    seen = observed(shot, image, None, None, 1)
+    vertices, material = ring(s)
+    glossy = {name: torch.zeros_like(material[name]) for name in SPECULAR if name in material}
+    pictures = []
+    for attributes in (material, material | glossy):
+        surface.write(vertices, attributes)
+        rgb, coverage = prediction.draw(surface, Photographs.of([shot], capture.room), 1, shadows=capture.shadows,
+                                        indirect=ring.indirect)  # fmt: skip
+        pictures.append(rgb[0].numpy())
+    full, diffuse = pictures
+    inside = ndimage.binary_erosion(coverage[0].numpy() > 0.99, np.ones((5, 5)))
+    clipped = ndimage.binary_dilation(seen.clipped[0].numpy().any(-1), np.ones((3, 3)))
+    typical = float(np.median(diffuse[inside])) if inside.any() else 1.0
+    usable = inside & ~clipped & (diffuse > DARK * typical).all(-1) & (full - diffuse <= GLOSSY * full).all(-1)
+    observed_diffuse = seen.rgb[0].numpy() - (full - diffuse)
+    ratio = np.maximum(observed_diffuse, 1e-3 * typical) / np.maximum(diffuse, 1e-3 * typical)
+    return np.log(ratio).clip(-LARGEST, LARGEST), usable
+
+
+class Points(NamedTuple):
+    """Points between the vertices of a mesh, at the centres of equal parts of its triangles."""
+
+    corners: np.ndarray  #: (N, 3) vertices of the triangle
+    shares: np.ndarray  #: (N, 3) barycentric coordinates
+
+    @classmethod
+    def of(cls, faces: np.ndarray, divisions: int) -> "Points":
+        """Make 4^`divisions` points in each triangle of `faces` (F, 3)."""
+        triangles = np.eye(3)[None]
+        for _ in range(divisions):
+            middles = (triangles + np.roll(triangles, -1, 1)) / 2
+            corners = [np.stack([triangles[:, k], middles[:, k], middles[:, k - 1]], 1) for k in range(3)]
+            triangles = np.concatenate([*corners, middles])
+        centres = triangles.mean(1).astype(np.float32)
+        return cls(np.repeat(faces, len(centres), 0), np.tile(centres, (len(faces), 1)))
+
+    def at(self, values: np.ndarray) -> np.ndarray:
+        """Interpolate values (V, n) of the vertices: (N, n) float32."""
+        return sum(self.shares[:, k, None] * values[self.corners[:, k]].astype(np.float32) for k in range(3))
+
+
+def bilinear(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Interpolate a picture (H, W, C) at pixel coordinates (N, 2): (N, C) float32. All must be inside it."""
+    rows = -(-len(pixels) // 4096)
+    maps = np.full((2, rows * 4096), 0.5, np.float32)
+    maps[:, : len(pixels)] = pixels.T - 0.5
+    across, down = maps.reshape(2, rows, 4096)
+    found = cv2.remap(picture, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return found.reshape(rows * 4096, -1)[: len(pixels)]
+
+
+def mean_around(grid: Grid, s: torch.Tensor, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the weighted means (nodes, C) of values (N, C) of points `s` (N, 3) around the corners of a grid.
+
+    The grid has one octave. `weights` (N,).
+    """
+    nodes = len(grid.keys(0))
+    sums, total = np.zeros((nodes, values.shape[1])), np.zeros(nodes)
+    for first in range(0, len(s), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        share, place = (x.numpy() for x in grid.octave_weights(s[part], 0))
+        share = share * weights[part, None]
+        total += np.bincount(place.ravel(), share.ravel(), nodes)
+        for c in range(values.shape[1]):
+            sums[:, c] += np.bincount(place.ravel(), (share * values[part, c, None]).ravel(), nodes)
+    return (sums / np.maximum(total, 1e-12)[:, None]).astype(np.float32)
+
+
+def smoothed(grid: Grid, s: torch.Tensor, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return values (N, C) of points `s` (N, 3) as a grid of one octave represents them."""
+    return interpolated(grid, s, mean_around(grid, s, values, weights))
+
+
+def interpolated(grid: Grid, s: torch.Tensor, nodes: np.ndarray) -> np.ndarray:
+    """Interpolate values (nodes, C) of the corners of a grid of one octave at points `s` (N, 3): (N, C)."""
+    result = np.empty((len(s), nodes.shape[1]), np.float32)
+    for first in range(0, len(s), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        share, place = (x.numpy() for x in grid.octave_weights(s[part], 0))
+        result[part] = np.einsum("nk,nkc->nc", share, nodes[place])
+    return result
+
+
+@torch.no_grad()
+def sharpen(before: Capture, refined: Capture, ring: FittedObject, fitted: Sequence[int], width: int) -> None:
+    """Give the material of `ring` a texture from larger photographs, in place, if they have anything finer.
+
+    `before`, `refined`: the capture before and after the calibration by the fit. `fitted`: indices of the photographs
+    to use. `width`: of the photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
+    """
+    widest = texture_width(before, fitted, width)
+    if not widest or not is_registered(ring.brdf_net) or isinstance(ring.brdf_net, SharpenedMaterial):
+        return
+    s, faces = ring.domain.sample(ring.subdivisions)
+    vertices, _ = ring(s.to(ring.center.device))
+    vertices = vertices.cpu().numpy()
+    shots = {k: at_width(before.shots[k], refined.shots[k], widest) for k in fitted if before.shots[k].files.filename}
+    eyes = {k: shot.camera.position for k, (_, shot) in shots.items()}
+    middle = ring.center.cpu().numpy()
+    resolution = float(np.median([  # pixels of a photograph for a length of 1 in scene units
+        shot.camera.focal.mean() / np.linalg.norm(eyes[k] - middle) for k, (_, shot) in shots.items()]))  # fmt: skip
+    corners = torch.from_numpy(faces)
+    areas = [float(area_vectors(torch.as_tensor(points), corners).norm(dim=1).sum()) / 2 for points in (s, vertices)]
+    stretch = math.sqrt(areas[1] / areas[0])
+    wanted = areas[1] * resolution**2 / len(faces)  # points in each triangle
+    most = math.floor(math.log(max(1.0, MOST_POINTS / len(faces)), 4))
+    points = Points.of(faces, min(most, max(0, math.ceil(math.log(wanted, 4)))))
+    places, at = points.at(vertices), torch.from_numpy(points.at(s.numpy()))
+    normals = points.at(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    visibility = Visibility(vertices, faces, [])
+    surface = Surface(refined.scene, refined.shape, ring)
+    surface.set_faces(faces)
+    ratios = Ratios(len(places))
+    for number, (k, (own, shot)) in enumerate(progress(shots.items(), "fine texture", len(shots))):
+        logarithms, usable = ratio_picture(surface, ring, s.to(ring.center.device), (before, own), (refined, shot))
+        view = MaskedCamera(shot.camera, usable.astype(np.uint8) * 255)
+        shown = np.flatnonzero(visibility.seen_by(view, places, normals))
+        pixels, _ = shot.camera.project(places[shown].astype(float))
+        away = eyes[k] - places[shown]
+        distance = np.linalg.norm(away, axis=1)
+        cosine = ((normals[shown] * away).sum(1) / distance).clip(0, 1)
+        weight = cosine**SLANT / (resolution * distance / shot.camera.focal.mean()) ** 2
+        ratios.add(number % 2, shown, bilinear(logarithms.astype(np.float32), pixels), weight.astype(np.float32))
+    values, weights = agreed(ratios, Grid.around(at, COARSE * widest / width / stretch / resolution, 1, 3), at)
+    if values is None:
+        return
+    seen = weights > 0
+    grid = Grid.around(at[seen], CELL / stretch / resolution, 1, 3)
+    nodes = np.zeros((len(grid.keys(0)), 3), np.float32)
+    for _ in range(SOLVING):  # of values whose interpolation has these means
+        missing = values[seen] - interpolated(grid, at[seen], nodes)
+        nodes += mean_around(grid, at[seen], missing, weights[seen])
+    grid.values[0].copy_(torch.from_numpy(nodes))
+    ring.brdf_net = SharpenedMaterial.of(ring.brdf_net, grid).to(ring.center.device)
+
+
+def agreed(ratios: Ratios, coarse: Grid, s: torch.Tensor) -> tuple[np.ndarray | None, np.ndarray]:
+    """Return what both halves of the photographs say of fine colours: (logarithms (N, 3), weights (N,)).
+
+    Coarse differences are subtracted. What remains is multiplied by the share of its variance, around each corner of
+    the grid `coarse`, that the halves have in common: so noise is left out (Wiener's filter). `s` (N, 3): the points.
+    The logarithms are None if the halves have hardly anything in common.
+    """
+    means, weights = ratios.means(), ratios.weights
+    total = weights.sum(0)
+    both = np.where((weights > 0).all(0), total, 0)
+    for half in range(2):
+        means[half] -= smoothed(coarse, s, means[half], weights[half])
+    mean = (means * weights[..., None]).sum(0) / np.maximum(total, 1e-9)[:, None]
+    common = smoothed(coarse, s, means.prod(0).mean(1, keepdims=True), both).clip(min=0)
+    different = smoothed(coarse, s, np.square(means[0] - means[1]).mean(1, keepdims=True) / 4, both)
+    if not both.any() or (both * common[:, 0]).sum() < CERTAIN * (both * (common + different)[:, 0]).sum():
+        return None, total
+    return mean * (common / np.maximum(common + different, 1e-12)), total

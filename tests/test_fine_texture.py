@@ -1,0 +1,207 @@
+"""Textures from photographs that are larger than those of the fit."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from mi_ring.capture.loading import load_capture
+from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
+from mi_ring.fitting import fine_texture
+from mi_ring.geometry.camera import Camera
+from mi_ring.images import linear_to_srgb, to_bytes, write_image
+from mi_ring.objects.detail import Grid
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.material_edits import EditedMaterial
+from mi_ring.objects.ring_file import compact, ring_of, ring_state
+from mi_ring.objects.sharpened_material import SharpenedMaterial
+from mi_ring.output.atlas import reflectances
+from mi_ring.scene.lights import Light
+from mi_ring.scene.shot import Files, Shot
+
+PALE = np.array([0.5, 0.4, 0.3])  #: colour without print, linear
+MATTE = PALE / np.pi  #: the diffuse parameter of `cooktorrance` for it
+
+
+def printed(points):
+    """Reflectance (V, 3) at points of the unit sphere: waves 12 pixels long in photographs of 160 pixels."""
+    x, y, z = points.T
+    return PALE * (1 + 0.5 * np.sin(33 * x + 3 * z + 1) * np.sin(31 * y - 2))[:, None]
+
+
+def plain(points):
+    return np.tile(PALE, (len(points), 1))
+
+
+def photographed(folder, colours, count=12, surface=lambda points: points, width=160):
+    """A scene file with photographs of a matte ball in a dark room, which Mitsuba's path tracer makes."""
+    ico = trimesh.creation.icosphere(7)
+    mesh = mi.Mesh("ball", len(ico.vertices), len(ico.faces), props=matte())
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = surface(ico.vertices).ravel().astype(np.float32)
+    params["faces"] = ico.faces.ravel().astype(np.uint32)
+    params.update()
+    mesh.add_attribute("vertex_colour", 3, colours(ico.vertices).ravel().astype(np.float32))
+    elements = []
+    for k in range(count):
+        height = 1 - (2 * k + 1) / count
+        around = np.array([np.cos(2.4 * k), np.sin(2.4 * k)]) * np.sqrt(1 - height**2)
+        eye = 4 * np.array([*around, height])
+        pose = np.array(mi.ScalarTransform4f().look_at(eye.tolist(), [0, 0, 0], [0.1, 0.2, 0.9]).matrix)
+        camera = Camera(pose, np.array([300.0, 300.0]), np.array([width / 2, width / 2 - 4]), (width, width - 10))
+        light = Light("point", eye + pose[:3, 0] * 0.4, np.array([30.0, 32.0, 34.0]))
+        picture = render(mesh, camera, light)
+        write_image(to_bytes(linear_to_srgb(picture)), folder / f"{k:02}.png")
+        elements.append(photograph_element(Shot(f"{k:02}", camera, light, files=Files(folder / f"{k:02}.png"))))
+    (folder / "scene.xml").write_bytes(scene_bytes(scene_element(elements, np.zeros(3), 1.3)))
+    return folder / "scene.xml"
+
+
+def matte():
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(
+        {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}
+    )
+    return props
+
+
+def render(mesh, camera, light):
+    """By stock plugins. Mitsuba counts the offset of the principal point upward."""
+    width, height = camera.size
+    sensor = {
+        "type": "perspective", "to_world": mi.ScalarTransform4f(camera.to_world),
+        "fov": float(np.degrees(2 * np.arctan(width / 2 / camera.focal[0]))), "fov_axis": "x",
+        "principal_point_offset_y": float((height / 2 - camera.centre[1]) / height),
+        "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
+    }  # fmt: skip
+    lamp = {"type": "point", "position": light.vector.tolist(), "intensity": {"type": "rgb", "value": light.rgb.tolist()}}
+    scene = mi.load_dict({"type": "scene", "mesh": mesh, "camera": sensor, "lamp": lamp,
+                          "integrator": {"type": "path", "max_depth": 2}})  # fmt: skip
+    return np.array(mi.render(scene, spp=64))[..., :3]
+
+
+def pale_ball():
+    """What a fit without any fine texture finds: a smooth matte ball of one colour."""
+    ring = FittedObject(np.zeros(3), 1.0, subdivisions=5)
+    with torch.no_grad():
+        for parameter in ring.parameters():
+            parameter.zero_()
+        last = [p for p in ring.brdf_net.parameters() if p.shape == (5,)][-1]
+        last.copy_(torch.tensor([*np.log(np.expm1(MATTE)), -30.0, 0.0]))
+    return ring
+
+
+def sharpened(scene, ring, width=40):
+    capture = load_capture(scene, width=width)
+    fine_texture.sharpen(capture, capture, ring, range(len(capture)), width)
+    return ring
+
+
+@pytest.fixture(scope="module")
+def print_scene(tmp_path_factory):
+    return photographed(tmp_path_factory.mktemp("print"), printed)
+
+
+@pytest.fixture(scope="module")
+def sharp(print_scene):
+    return sharpened(print_scene, pale_ball())
+
+
+def on_the_ball(count=4000):
+    points = np.random.default_rng(3).normal(size=(count, 3))
+    return (points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_print_that_the_fit_has_not_seen_is_found(sharp):
+    """Photographs of 160 px, a fit of 40 px, in which the waves are 3 pixels long."""
+    s = on_the_ball()
+    found = reflectances(sharp, s)["diffuse"] / MATTE - 1
+    true = printed(s) / PALE - 1
+    for channel in range(3):
+        assert np.corrcoef(found[:, channel], true[:, channel])[0, 1] > 0.99
+        assert (found * true).sum() / (true**2).sum() == pytest.approx(1, abs=0.1)
+
+
+def test_meshes_keep_the_colours_that_they_can_show(sharp):
+    s = torch.from_numpy(on_the_ball())
+    np.testing.assert_allclose(sharp.material(s)["diffuse"].detach(), plain(s) / np.pi, rtol=1e-5)
+
+
+def test_a_ball_of_one_colour_keeps_it(tmp_path):
+    """Though its surface has ripples that the fit has not found, which darken and brighten it."""
+
+    def rippled(points):
+        return points * (1 + 0.004 * np.sin(30 * points[:, :1]) * np.sin(28 * points[:, 1:2]))
+
+    s = on_the_ball()
+    colours = reflectances(sharpened(photographed(tmp_path, plain, 24, rippled), pale_ball()), s)["diffuse"]
+    assert (colours / MATTE).std(0).max() < 0.02
+
+
+def test_it_is_in_the_file_and_edits_reach_it(sharp):
+    s = on_the_ball(500)
+    again = ring_of(compact(ring_state(sharp)))
+    assert isinstance(again.brdf_net, SharpenedMaterial)
+    np.testing.assert_allclose(reflectances(again, s)["diffuse"], reflectances(sharp, s)["diffuse"], atol=2e-3)
+    again.brdf_net = EditedMaterial(again.brdf_net, {"diffuse": (0.5, 1.0, 1.0)}, {})
+    halved = reflectances(again, s)["diffuse"] / reflectances(sharp, s)["diffuse"]
+    np.testing.assert_allclose(halved, np.tile([0.5, 1, 1], (500, 1)), atol=0.02)
+
+
+@pytest.mark.parametrize(("width", "options"), [(160, {}), (140, {}), (40, {"fitted": []})])
+def test_nothing_changes_without_larger_photographs(print_scene, width, options):
+    capture, ring = load_capture(print_scene, width=width), pale_ball()
+    before = ring.brdf_net
+    fine_texture.sharpen(capture, capture, ring, options.get("fitted", range(12)), width)
+    assert ring.brdf_net is before
+
+
+def test_noise_alone_is_no_texture():
+    random = np.random.default_rng(1)
+    s = torch.from_numpy(on_the_ball(20000))
+    coarse = Grid.around(s, 0.2, 1, 3)
+    ratios = fine_texture.Ratios(len(s))
+    for photograph in range(8):
+        noise = random.normal(0, 0.3, (len(s), 3)).astype(np.float32)
+        ratios.add(photograph % 2, np.arange(len(s)), noise, np.ones(len(s), np.float32))
+    assert fine_texture.agreed(ratios, coarse, s)[0] is None
+
+
+def test_what_both_halves_show_is_taken_but_not_what_is_coarse():
+    random = np.random.default_rng(1)
+    s = torch.from_numpy(on_the_ball(40000))
+    x = s[:, :1].numpy()
+    fine, broad = 0.3 * np.sin(60 * x), 0.5 * x
+    ratios = fine_texture.Ratios(len(s))
+    for photograph in range(8):
+        shown = fine + broad + random.normal(0, 0.3, (len(s), 3))
+        ratios.add(photograph % 2, np.arange(len(s)), shown.astype(np.float32), np.ones(len(s), np.float32))
+    values, _ = fine_texture.agreed(ratios, Grid.around(s, 0.2, 1, 3), s)
+    # Wiener's filter: of the mean of eight, noise has 0.3² / 8, the waves have 0.3² / 2.
+    share = 0.5 / (0.5 + 1 / 8)
+    assert (values * fine).sum() / (3 * (fine**2).sum()) == pytest.approx(share, abs=0.08)
+    assert abs((values * x).sum() / (3 * (x**2).sum())) < 0.03
+
+
+@pytest.mark.parametrize("divisions", [0, 1, 3])
+def test_points_divide_triangles_evenly(divisions):
+    faces = np.array([[0, 1, 2], [2, 1, 3]])
+    vertices = np.array([[0, 0, 0], [1, 0, 0.5], [0, 2, 1], [3, 3, 0]])
+    points = fine_texture.Points.of(faces, divisions)
+    places = points.at(vertices)
+    assert len(places) == 2 * 4**divisions == len(np.unique(places.round(5), axis=0))
+    np.testing.assert_allclose(points.shares.sum(1), 1, rtol=1e-6)
+    np.testing.assert_allclose(places.reshape(2, -1, 3).mean(1), vertices[faces].mean(1), rtol=1e-5)
+    # The second moment of points at the centres of 4ᵈ equal parts: that of the triangle, less that of a part.
+    spread = np.square(places.reshape(2, -1, 3) - vertices[faces].mean(1)[:, None]).sum(2).mean(1)
+    whole = np.square(vertices[faces] - vertices[faces].mean(1)[:, None]).sum((1, 2)) / 12
+    np.testing.assert_allclose(spread, whole * (1 - 0.25**divisions), rtol=1e-4, atol=1e-12)
+
+
+def test_a_picture_is_interpolated_linearly():
+    y, x = np.mgrid[:20, :30] + 0.5  # centres of pixels
+    picture = np.stack([x, 3 * y, x - y], -1).astype(np.float32)
+    at = np.random.default_rng(0).uniform([1, 1], [29, 19], (5000, 2))
+    expected = np.stack([at[:, 0], 3 * at[:, 1], at[:, 0] - at[:, 1]], -1)
+    np.testing.assert_allclose(fine_texture.bilinear(picture, at), expected, atol=0.12)  # OpenCV has 32 steps a pixel
