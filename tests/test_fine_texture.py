@@ -75,7 +75,8 @@ def render(mesh, camera, light):
         "principal_point_offset_y": float((height / 2 - camera.centre[1]) / height),
         "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
     }  # fmt: skip
-    lamp = {"type": "point", "position": light.vector.tolist(), "intensity": {"type": "rgb", "value": light.rgb.tolist()}}
+    lamp = {"type": "point", "position": light.vector.tolist(),
+            "intensity": {"type": "rgb", "value": light.rgb.tolist()}}  # fmt: skip
     scene = mi.load_dict({"type": "scene", "mesh": mesh, "camera": sensor, "lamp": lamp,
                           "integrator": {"type": "path", "max_depth": 2}})  # fmt: skip
     return np.array(mi.render(scene, spp=64))[..., :3]
@@ -94,8 +95,7 @@ def pale_ball():
 
 def sharpened(scene, ring, width=40):
     capture = load_capture(scene, width=width)
-    fine_texture.sharpen(capture, capture, ring, range(len(capture)), width)
-    return ring
+    return fine_texture.sharpened(capture, capture, ring, range(len(capture)), width)
 
 
 @pytest.fixture(scope="module")
@@ -152,9 +152,7 @@ def test_it_is_in_the_file_and_edits_reach_it(sharp):
 @pytest.mark.parametrize(("width", "options"), [(160, {}), (140, {}), (40, {"fitted": []})])
 def test_nothing_changes_without_larger_photographs(print_scene, width, options):
     capture, ring = load_capture(print_scene, width=width), pale_ball()
-    before = ring.brdf_net
-    fine_texture.sharpen(capture, capture, ring, options.get("fitted", range(12)), width)
-    assert ring.brdf_net is before
+    assert fine_texture.sharpened(capture, capture, ring, options.get("fitted", range(12)), width) is ring
 
 
 def test_noise_alone_is_no_texture():

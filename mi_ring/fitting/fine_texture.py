@@ -45,7 +45,7 @@ SPECULAR = "specular", "specular_reflectance"  #: names of the parameter of high
 CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have in common
 
 
-def texture_width(given: Capture, fitted: Sequence[int], width: int) -> int:
+def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray, width: int) -> int:
     """Choose the width to which photographs are reduced for the texture [px]. Returns 0 if it would not be finer.
 
     `given`: the capture of the fit, which may be reduced. `fitted`: indices of its photographs that are fitted.
@@ -182,15 +182,18 @@ def interpolated(grid: Grid, s: torch.Tensor, nodes: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def sharpen(before: Capture, refined: Capture, ring: FittedObject, fitted: Sequence[int], width: int) -> None:
-    """Give the material of `ring` a texture from larger photographs, in place, if they have anything finer.
+def sharpened(
+    before: Capture, refined: Capture, ring: FittedObject, fitted: Sequence[int] | np.ndarray, width: int
+) -> FittedObject:
+    """Return a copy of an object whose colours have a texture from larger photographs, or the object itself.
 
+    It is the object itself if no photograph is larger than the fit has seen it, or if they show nothing finer.
     `before`, `refined`: the capture before and after the calibration by the fit. `fitted`: indices of the photographs
     to use. `width`: of the photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
     widest = texture_width(before, fitted, width)
-    if not widest or not is_registered(ring.brdf_net) or isinstance(ring.brdf_net, SharpenedMaterial):
-        return
+    if not widest or not is_registered(ring.brdf_net):
+        return ring
     s, faces = ring.domain.sample(ring.subdivisions)
     vertices, _ = ring(s.to(ring.center.device))
     vertices = vertices.cpu().numpy()
@@ -224,7 +227,7 @@ def sharpen(before: Capture, refined: Capture, ring: FittedObject, fitted: Seque
         ratios.add(number % 2, shown, bilinear(logarithms.astype(np.float32), pixels), weight.astype(np.float32))
     values, weights = agreed(ratios, Grid.around(at, COARSE * widest / width / stretch / resolution, 1, 3), at)
     if values is None:
-        return
+        return ring
     seen = weights > 0
     grid = Grid.around(at[seen], CELL / stretch / resolution, 1, 3)
     nodes = np.zeros((len(grid.keys(0)), 3), np.float32)
@@ -232,7 +235,11 @@ def sharpen(before: Capture, refined: Capture, ring: FittedObject, fitted: Seque
         missing = values[seen] - interpolated(grid, at[seen], nodes)
         nodes += mean_around(grid, at[seen], missing, weights[seen])
     grid.values[0].copy_(torch.from_numpy(nodes))
-    ring.brdf_net = SharpenedMaterial.of(ring.brdf_net, grid).to(ring.center.device)
+    return FittedObject(
+        ring.center, float(ring.radius), domain=ring.domain, bsdf=ring.bsdf, indirect=ring.indirect, up=ring.up,
+        subdivisions=ring.subdivisions, ground=ring.ground, metres=ring.metres,
+        networks=(ring.shape_net, SharpenedMaterial.of(ring.brdf_net, grid)),
+    ).to(ring.center.device)  # fmt: skip
 
 
 def agreed(ratios: Ratios, coarse: Grid, s: torch.Tensor) -> tuple[np.ndarray | None, np.ndarray]:

@@ -16,7 +16,6 @@ from mi_ring.capture.loading import recompute_normals
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.course import Course
-from mi_ring.fitting.fine_texture import sharpen
 from mi_ring.fitting.iteration import Context, Iteration
 from mi_ring.fitting.lighting import AMBIGUOUS, Lighting
 from mi_ring.fitting.mask_refinement import find_masks, with_masks
@@ -170,19 +169,9 @@ class Fit(Renamed):
         return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 
     def result(self) -> FitResult:
-        """Collect the results of the fit, for the functions of `mi_ring.output` that write them.
-
-        At the end of a fit with details, the material first gets a texture from larger photographs, if there are any.
-        """
-        result = result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
-                           list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
-        detailed = self.schedule.stages[-1].detail and self.problem.config.detail in ("texture", "both")
-        if detailed and self.iteration == self.iterations:
-            try:
-                sharpen(self.capture, result.capture, self.ring, self.problem.fitted, result.width)
-            except InputError as error:  # a file has gone: all else is saved
-                print(f"There is no texture from larger photographs: {error}")
-        return result
+        """Collect the results of the fit, for the functions of `mi_ring.output` that write them."""
+        return result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
+                         list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
 
     def save(self, folder: str | Path) -> None:
         """Write `ring.pt`, `mesh.ply`, `scene.xml`, `report.html` and other results into a folder.

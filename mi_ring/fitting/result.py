@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from mi_ring.capture.capture import Capture
+from mi_ring.errors import InputError
 from mi_ring.fitting.course import Course
 from mi_ring.fitting.covariance import covariance
+from mi_ring.fitting.fine_texture import sharpened
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
@@ -26,6 +28,8 @@ def result_of(
 ) -> FitResult:  # fmt: skip
     """Collect the results of a fit, from which files are written later. Writes no files, but evaluates the surface.
 
+    At the end of a fit with details, the material first gets a texture from larger photographs, if there are any.
+
     `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: share of the
     observed light that recent predictions do not explain.
     """
@@ -35,6 +39,11 @@ def result_of(
         masked = replace(problem, capture=capture)
         return summary(problem, model, refined, covariance(masked, model, renderer, ring.subdivisions))
 
+    if course.iteration == schedule.iterations and schedule.stages[-1].detail and problem.config.detail != "shape":
+        try:
+            ring = sharpened(capture, refined, ring, problem.fitted, problem.config.widths[-1])
+        except InputError as error:  # a file has gone; all else can be saved
+            print(f"There is no texture from larger photographs: {error}")
     return FitResult(
         ring=ring,
         surface=renderer.show(model, ring.subdivisions),

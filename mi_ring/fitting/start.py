@@ -26,6 +26,7 @@ from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_of
+from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.system.optional import installed
 
@@ -112,7 +113,7 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
         for network, needed in zip(networks, ("forward", "set_parameters"), strict=True):
             if not hasattr(network, needed):
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
-        if isinstance(networks[0], DetailedFlow) or isinstance(networks[1], DetailedMaterial):
+        if isinstance(networks[0], DetailedFlow) or isinstance(networks[1], DetailedMaterial | SharpenedMaterial):
             raise InputError("networks: have details, which a fit adds itself; give their base.network instead")
         networks[1].set_parameters(parameters, scale)
     else:
