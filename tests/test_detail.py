@@ -19,6 +19,7 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.optimisation import detail_steppers
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.objects import detail
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import compact, ring_of, ring_state
@@ -48,6 +49,19 @@ def test_each_octave_reproduces_linear_functions():
             grid.values[k].data.zero_()
         grid.values[octave].data = corner_places(grid, octave) @ slope
         assert torch.allclose(grid(s), s @ slope, atol=1e-5)
+
+
+def test_many_points_are_evaluated_in_parts(monkeypatch):
+    grid, s = grid_of(), points_near()
+    for values in grid.values:
+        values.data = torch.randn(values.shape, generator=torch.Generator().manual_seed(1))
+    whole = grid(s).sum() + grid(s)[250].sum()
+    gradients = torch.autograd.grad(whole, grid.values)
+    monkeypatch.setattr(detail, "PART", 120)
+    assert torch.equal(grid(s).sum() + grid(s)[250].sum(), whole)
+    assert max(len(points) for points, *_ in grid.latest) <= 120
+    for own, expected in zip(torch.autograd.grad(grid(s).sum() + grid(s)[250].sum(), grid.values), gradients):
+        torch.testing.assert_close(own, expected)
 
 
 def test_a_constant_is_reproduced_also_where_a_corner_is_missing():

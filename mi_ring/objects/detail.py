@@ -22,6 +22,7 @@ from mi_ring.system.machine import release_memory
 
 CORNERS = torch.tensor(list(itertools.product((0, 1), repeat=3)))  #: (8, 3) of a cube
 AT_ONCE = 2**16  #: points whose weights are computed at once
+PART = 2**20  #: points whose weights are kept: more than a mesh of a fit has, fewer than one to export may have
 MOST = 2**20  #: coordinates of cubes are from -`MOST` to `MOST` - 1
 PLACES = torch.tensor([2**42, 2**21, 1])  #: a key is the scalar product of these and of coordinates from -`MOST`
 
@@ -111,6 +112,8 @@ class Grid(nn.Module):
 
     def forward(self, s: Tensor, values: Sequence[Tensor] | None = None) -> Tensor:
         """Interpolate at points (V, 3): (V, channels). `values` (N, channels) of each octave replace the grid's own."""
+        if len(s) > PART:
+            return torch.cat([self(part, values) for part in s.split(PART)])
         several = zip(self.weights(s), self.values if values is None else values)
         return torch.stack([_Product.apply(own, weights) for weights, own in several]).sum(0)
 
