@@ -19,6 +19,7 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.optimisation import detail_steppers
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.nets.brdf_net import BRDFNet
 from mi_ring.objects import detail
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
 from mi_ring.objects.fitted_object import FittedObject
@@ -49,6 +50,16 @@ def test_each_octave_reproduces_linear_functions():
             grid.values[k].data.zero_()
         grid.values[octave].data = corner_places(grid, octave) @ slope
         assert torch.allclose(grid(s), s @ slope, atol=1e-5)
+
+
+def test_gloss_changes_a_third_as_much_as_colour():
+    s, net = points_near(), BRDFNet()
+    detailed = DetailedMaterial.of(net, Grid.around(s, 0.11, 3, 5))
+    before = net.evaluate(s)
+    for values in detailed.grid.values:
+        values.data.fill_(0.2)
+    expected = torch.tensor([0.6, 0.6, 0.6, 0.2, 0.2]).expand(len(s), 5)  # three octaves
+    torch.testing.assert_close(detailed.evaluate(s) - before, expected, atol=1e-4, rtol=0)
 
 
 def test_many_points_are_evaluated_in_parts(monkeypatch):

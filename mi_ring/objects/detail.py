@@ -23,6 +23,8 @@ from mi_ring.system.machine import release_memory
 CORNERS = torch.tensor(list(itertools.product((0, 1), repeat=3)))  #: (8, 3) of a cube
 AT_ONCE = 2**16  #: points whose weights are computed at once
 PART = 2**20  #: points whose weights are kept: more than a mesh of a fit has, fewer than one to export may have
+#: Changes of highlights by those of colours. Few photographs show a highlight, so larger changes do not suit others.
+GLOSS = 1 / 3
 MOST = 2**20  #: coordinates of cubes are from -`MOST` to `MOST` - 1
 PLACES = torch.tensor([2**42, 2**21, 1])  #: a key is the scalar product of these and of coordinates from -`MOST`
 
@@ -224,7 +226,10 @@ class DetailedFlow(Flow):
 
 @register_network("detailed-material")
 class DetailedMaterial(MaterialNet):
-    """A BRDF-Net, and what a grid adds to its outputs before these are mapped to the ranges of the parameters."""
+    """A BRDF-Net, and what a grid adds to its outputs before these are mapped to the ranges of the parameters.
+
+    Values of parameters that are no colours are multiplied by `GLOSS`.
+    """
 
     base: Remembered
     grid: Grid
@@ -248,4 +253,5 @@ class DetailedMaterial(MaterialNet):
         return {"net": architecture_of(self.base.network), "grid": self.grid.arguments()}
 
     def evaluate(self, s: Tensor) -> Tensor:
-        return self.base(s).float() + self.grid(s)
+        factors = [1.0 if p.channels == 3 else GLOSS for p in self.bsdf_parameters for _ in range(p.channels)]
+        return self.base(s).float() + self.grid(s) * torch.tensor(factors, device=s.device)
