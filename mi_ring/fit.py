@@ -17,6 +17,7 @@ from mi_ring.errors import InputError
 from mi_ring.fit_config import FitConfig, parse_options
 from mi_ring.fitting.budget import Costs, all_stages, fewest_seconds, fitting_into, measure, replan
 from mi_ring.fitting.checkpoint import read_checkpoint, resumed
+from mi_ring.fitting.fine_texture import texture_seconds
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.light_selection import choose_lighting
 from mi_ring.fitting.processes import Processes, joined
@@ -144,7 +145,11 @@ def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitC
     if (needed := spent + fewest_seconds(choice, fit.plan, costs)) > 60 * minutes:
         raise InputError(f"--minutes: is {minutes:g}, too few for a fit of this capture on this machine; give "
                          f"{math.ceil(MARGIN * needed / 6) / 10:g} or more")  # fmt: skip
-    chosen = fitting_into(60 * minutes - spent, choice, fit.plan, costs)
+    left = 60 * minutes - spent
+    chosen = fitting_into(left, choice, fit.plan, costs)
+    if chosen.detail in ("texture", "both"):
+        left -= texture_seconds(fit.capture, fit.problem.fitted, max(chosen.widths))
+        chosen = fitting_into(max(left, fewest_seconds([chosen], fit.plan, costs)), [chosen], fit.plan, costs)
     print(f"In about {minutes:g} minutes: --preset {chosen.preset} --iterations {chosen.iterations}")
     return chosen, costs
 

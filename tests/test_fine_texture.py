@@ -152,7 +152,11 @@ def test_it_is_in_the_file_and_edits_reach_it(sharp):
 @pytest.mark.parametrize(("width", "options"), [(160, {}), (140, {}), (40, {"fitted": []})])
 def test_nothing_changes_without_larger_photographs(print_scene, width, options):
     capture, ring = load_capture(print_scene, width=width), pale_ball()
-    assert fine_texture.sharpened(capture, capture, ring, options.get("fitted", range(12)), width) is ring
+    fitted = options.get("fitted", range(12))
+    assert fine_texture.sharpened(capture, capture, ring, fitted, width) is ring
+    assert fine_texture.texture_seconds(capture, fitted, width) == 0
+    twice, once = (fine_texture.texture_seconds(capture, range(n), 40) for n in (12, 6))
+    assert twice == 2 * once > 0
 
 
 def test_noise_alone_is_no_texture():

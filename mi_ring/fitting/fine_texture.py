@@ -57,6 +57,12 @@ def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray, width: int
     return widest if widest >= WORTH * width else 0
 
 
+def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray, width: int) -> float:
+    """Estimate how long `sharpened` takes [s] on two cores. The arguments are those of `texture_width`."""
+    widest = texture_width(given, fitted, width)
+    return len(fitted) * (0.3 + 1.1e-6 * widest**2) if widest else 0.0
+
+
 def at_width(given: Shot, refined: Shot, width: int) -> tuple[Shot, Shot]:
     """Return a photograph of the fit at another width: (with the given calibration, with the refined one).
 

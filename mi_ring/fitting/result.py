@@ -41,7 +41,7 @@ def result_of(
 
     if course.iteration == schedule.iterations and schedule.stages[-1].detail and problem.config.detail != "shape":
         try:
-            ring = sharpened(capture, refined, ring, problem.fitted, problem.config.widths[-1])
+            ring = sharpened(capture, refined, ring, problem.fitted, max(problem.config.widths))
         except InputError as error:  # a file has gone; all else can be saved
             print(f"There is no texture from larger photographs: {error}")
     return FitResult(
