@@ -142,7 +142,7 @@ def steps_of(pictures: Path) -> list[list[Part]]:
 
     `pictures`: folder of the photographs. 58 photographs of 0.8 megapixels and 80 of 13 megapixels were measured.
     """
-    files = [file for file in sorted(pictures.glob("[!.]*")) if file.suffix.lower() in SUFFIXES] if pictures else []
+    files = [file for file in sorted(pictures.glob("[!.]*")) if file.suffix.lower() in SUFFIXES]
     count, size = max(3, len(files)), 1e6
     with contextlib.suppress(Exception):  # the command itself says what is wrong
         size = math.prod(image_size(files[0]))

@@ -11,7 +11,7 @@ import trimesh
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
-from mi_ring.fitting import agreeing_adam
+from mi_ring.fitting import agreeing_adam, result
 from mi_ring.fitting.agreeing_adam import AgreeingAdam
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import add_detail, detail_levels, share_weights, unfold
@@ -429,6 +429,22 @@ def test_the_networks_stay_as_they_were(detailed, small_capture):
     for name, value in alone.ring.shape_net.state_dict().items():
         assert torch.equal(value, fit.ring.shape_net.base.network.state_dict()[name])
     assert any(values.any() for values in fit.ring.brdf_net.grid.values)
+
+
+def test_a_finished_fit_asks_for_a_texture_in_its_own_light(detailed, small_capture, monkeypatch, capsys):
+    asked = []
+
+    def gone(before, refined, surface, ring, fitted, width):
+        asked.append((surface, ring, len(fitted), width))
+        raise InputError("000.png: no such file")
+
+    monkeypatch.setattr(result, "sharpened", gone)
+    fit, states = detailed
+    assert fit.result().ring is fit.ring  # all else can be saved
+    assert asked == [(fit.renderer.surface, fit.ring, 12, SMALL.widths[-1])]
+    assert "no texture from larger photographs: 000.png" in capsys.readouterr().out
+    Fit(load_capture(small_capture), SMALL, state=states[31]).result()  # not at its end
+    assert len(asked) == 1
 
 
 @pytest.mark.parametrize("kind", ["texture", "shape"])

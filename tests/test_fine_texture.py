@@ -1,5 +1,7 @@
 """Textures from photographs that are larger than those of the fit."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -7,18 +9,24 @@ import torch
 import trimesh
 
 from mi_ring.capture.loading import load_capture
+from mi_ring.capture.observation import Observation
+from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting import fine_texture
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
+from mi_ring.nets.brdf_net import BRDFNet, Parameter
 from mi_ring.objects.detail import Grid
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import EditedMaterial
 from mi_ring.objects.ring_file import compact, ring_of, ring_state
 from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.output.atlas import reflectances
+from mi_ring.rendering import prediction
+from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import Light
-from mi_ring.scene.shot import Files, Shot
+from mi_ring.scene.shot import Files, Response, Shot
 
 PALE = np.array([0.5, 0.4, 0.3])  #: colour without print, linear
 MATTE = PALE / np.pi  #: the diffuse parameter of `cooktorrance` for it
@@ -93,9 +101,11 @@ def pale_ball():
     return ring
 
 
-def sharpened(scene, ring, width=40):
-    capture = load_capture(scene, width=width)
-    return fine_texture.sharpened(capture, capture, ring, range(len(capture)), width)
+def sharpened(capture, ring, width=40, fitted=range(100)):
+    surface = Surface(capture.scene, capture.shape, ring)
+    surface.show(ring, *ring.domain.sample(ring.subdivisions))
+    fitted = [k for k in fitted if k < len(capture)]
+    return fine_texture.sharpened(capture, capture, surface, ring, fitted, width)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +115,7 @@ def print_scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sharp(print_scene):
-    return sharpened(print_scene, pale_ball())
+    return sharpened(load_capture(print_scene, width=40), pale_ball())
 
 
 def on_the_ball(count=4000):
@@ -134,8 +144,8 @@ def test_a_ball_of_one_colour_keeps_it(tmp_path):
     def rippled(points):
         return points * (1 + 0.004 * np.sin(30 * points[:, :1]) * np.sin(28 * points[:, 1:2]))
 
-    s = on_the_ball()
-    colours = reflectances(sharpened(photographed(tmp_path, plain, 24, rippled), pale_ball()), s)["diffuse"]
+    capture = load_capture(photographed(tmp_path, plain, 24, rippled), width=40)
+    colours = reflectances(sharpened(capture, pale_ball()), on_the_ball())["diffuse"]
     assert (colours / MATTE).std(0).max() < 0.02
 
 
@@ -149,14 +159,60 @@ def test_it_is_in_the_file_and_edits_reach_it(sharp):
     np.testing.assert_allclose(halved, np.tile([0.5, 1, 1], (500, 1)), atol=0.02)
 
 
-@pytest.mark.parametrize(("width", "options"), [(160, {}), (140, {}), (40, {"fitted": []})])
-def test_nothing_changes_without_larger_photographs(print_scene, width, options):
-    capture, ring = load_capture(print_scene, width=width), pale_ball()
-    fitted = options.get("fitted", range(12))
-    assert fine_texture.sharpened(capture, capture, ring, fitted, width) is ring
+@pytest.mark.parametrize(("width", "fitted"), [(160, range(12)), (140, range(12)), (40, [])])
+def test_nothing_changes_without_larger_photographs(print_scene, width, fitted):
+    ring, capture = pale_ball(), load_capture(print_scene, width=width)
+    assert sharpened(capture, ring, width, fitted) is ring
     assert fine_texture.texture_seconds(capture, fitted, width) == 0
     twice, once = (fine_texture.texture_seconds(capture, range(n), 40) for n in (12, 6))
     assert twice == 2 * once > 0
+
+
+@pytest.mark.parametrize("name", ["masks", "valid"])
+def test_only_valid_pixels_of_the_object_count(print_scene, name):
+    capture, ring = load_capture(print_scene, width=40), pale_ball()
+    none = Pixels.of([np.zeros(shot.size[::-1], np.uint8) for shot in capture.shots])
+    assert sharpened(replace(capture, **{name: none}), ring) is ring
+
+
+def test_a_material_without_albedo_has_no_texture(print_scene):
+    ring = pale_ball()
+    ring.brdf_net = BRDFNet(parameters=[Parameter("specular_reflectance", 3, 0.0, 1.0)])
+    capture = load_capture(print_scene, width=40)
+    assert fine_texture.sharpened(capture, capture, None, ring, range(12), 40) is ring
+
+
+def test_highlights_are_subtracted_and_strong_ones_left_out(print_scene):
+    capture, ring = load_capture(print_scene, width=160), pale_ball()
+    with torch.no_grad():
+        [p for p in ring.brdf_net.parameters() if p.shape == (5,)][-1][3:] = torch.tensor([0.0, -2.0])
+        s, faces = ring.domain.sample(5)
+        vertices, material = ring(s)
+    surface, shot = Surface(capture.scene, capture.shape, ring), capture.shots[0]
+    surface.set_faces(faces)
+    pictures = []
+    for specular in (torch.zeros(len(s)), material["specular"]):
+        surface.write(vertices, material | {"specular": specular})
+        rgb, coverage = prediction.draw(surface, Photographs.of([shot]), 1)
+        pictures.append(rgb)
+    diffuse, full = pictures
+    seen = Observation(full + diffuse, torch.zeros_like(full, dtype=torch.bool), coverage, torch.tensor([False]), None)
+    highlights = {"specular": material["specular"]}
+    logarithms, usable = fine_texture.ratio_picture(surface, ring, highlights, capture, shot, seen)
+    strong = (full - diffuse > diffuse).any(-1)[0].numpy()
+    assert usable.sum() > 1000 and strong.sum() > 20 and not (strong & usable).any()
+    np.testing.assert_allclose(logarithms[usable], np.log(2), atol=1e-3)
+
+
+def test_photographs_are_decoded_with_the_curve_that_the_fit_has_found(print_scene):
+    capture = load_capture(print_scene, width=40)
+    given = capture.shots[0]
+    plain, curved = (
+        fine_texture.enlarged(capture, 0, *fine_texture.at_width(given, replace(given, response=Response(gamma)), 160))
+        for gamma in (1, 2)
+    )
+    assert plain.rgb.shape == (1, 148, 160, 3)  # what the fit sees at 40 px: whole blocks of 4 × 4 px
+    np.testing.assert_allclose(curved.rgb, plain.rgb**0.5, atol=2e-3)
 
 
 def test_noise_alone_is_no_texture():
@@ -206,4 +262,5 @@ def test_a_picture_is_interpolated_linearly():
     picture = np.stack([x, 3 * y, x - y], -1).astype(np.float32)
     at = np.random.default_rng(0).uniform([1, 1], [29, 19], (5000, 2))
     expected = np.stack([at[:, 0], 3 * at[:, 1], at[:, 0] - at[:, 1]], -1)
+    assert fine_texture.bilinear(picture, at[:0]).shape == (0, 3)
     np.testing.assert_allclose(fine_texture.bilinear(picture, at), expected, atol=0.12)  # OpenCV has 32 steps a pixel

@@ -55,10 +55,18 @@ def test_a_small_part_tells_nothing(clock):
     with Steps([Part("sheet", 1)], [Part("features", 99)]) as steps:
         steps.named("sheet")
         clock[0] += 30  # most of it to load libraries
+        assert steps.left(1.0) is None
         steps.named("features")
         assert steps.left(0.05) is None
         clock[0] += 20
         assert steps.left(0.2) == pytest.approx(80)
+
+
+def test_a_part_that_was_not_expected_tells_nothing(clock):
+    with Steps([Part("table", 0), Part("masks", 9)]) as steps:
+        steps.named("table")
+        clock[0] += 3
+        assert steps.left(0.5) is None
 
 
 def test_the_bar_shows_the_time_that_all_steps_need(clock):

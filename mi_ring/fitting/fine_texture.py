@@ -19,17 +19,18 @@ from scipy import ndimage
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import read_photograph
-from mi_ring.capture.observation import observed
+from mi_ring.capture.observation import Observation, observed
 from mi_ring.capture.reduction import reduced_image, windowed
 from mi_ring.geometry.meshes import area_vectors
-from mi_ring.nets.registry import is_registered
 from mi_ring.objects.detail import AT_ONCE, Grid
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.sharpened_material import SharpenedMaterial
+from mi_ring.objects.material_edits import SPECULAR
+from mi_ring.objects.sharpened_material import SharpenedMaterial, albedo_of
 from mi_ring.rendering import prediction
+from mi_ring.rendering.bridge import to_drjit
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
-from mi_ring.scene.shot import Shot
+from mi_ring.scene.shot import Shot, Window
 from mi_ring.scene.visibility import MaskedCamera, Visibility
 from mi_ring.system.progress import progress
 
@@ -40,8 +41,8 @@ COARSE = 8.0  #: differences that are coarser than this are left out [px of the 
 MOST_POINTS = 6_000_000
 DARK, GLOSSY = 0.03, 0.5  #: least prediction [median of the object], and largest share of highlights in it
 LARGEST = 1.5  #: largest change of a colour, as a logarithm
+SQUARE = np.ones((3, 3))  #: a pixel and its neighbours
 SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
-SPECULAR = "specular", "specular_reflectance"  #: names of the parameter of highlights
 CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have in common
 
 
@@ -68,10 +69,22 @@ def at_width(given: Shot, refined: Shot, width: int) -> tuple[Shot, Shot]:
 
     Both show what the photograph of the fit shows. `width`: the largest width [px].
     """
-    whole = given.whole
-    window = given.window or windowed(whole.size, (0, 0), whole.size, width)
+    window = given.window or Window((0, 0), given.size, given.size, given.size)
     window = windowed(window.whole, window.corner, window.extent, width)
-    return whole.through(window), refined.whole.through(window)
+    return given.whole.through(window), refined.whole.through(window)
+
+
+def enlarged(before: Capture, k: int, own: Shot, shot: Shot) -> Observation:
+    """Read photograph `k` of the capture `before` at another width, decoded with the refined response of the camera.
+
+    Its mask and its valid pixels are those of the fit, enlarged. `own`, `shot`: as `at_width` returns them. Raises
+    InputError if the file cannot be read.
+    """
+    assert own.window
+    size = own.window.size
+    image = reduced_image(shot.whole, partial(read_photograph, own.whole, before.path), own.window)
+    mask, valid = (None if part is None else cv2.resize(part, size) for part in (before.masks[k], before.valid[k]))
+    return observed(shot, image, mask, valid, 1)
 
 
 class Ratios:
@@ -94,33 +107,30 @@ class Ratios:
 
 
 def ratio_picture(
-    surface: Surface, ring: FittedObject, s: torch.Tensor, given: tuple[Capture, Shot], refined: tuple[Capture, Shot]
-) -> tuple[np.ndarray, np.ndarray]:
+    surface: Surface, ring: FittedObject, highlights: dict[str, torch.Tensor], refined: Capture, shot: Shot,
+    seen: Observation,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Compare a photograph with its prediction. Returns (logarithms of ratios (H, W, 3), which are usable (H, W)).
 
-    `surface`: in which the object is rendered. `s`: domain points of its vertices. `given`, `refined`: capture and
-    photograph before and after the calibration by the fit.
+    A pixel is usable if it and its neighbours show nothing but the object, lit, neither clipped nor in a highlight.
+
+    `surface`: shows the object `ring`. `highlights`: the parameter of its highlights (V,) or (V, 3) by name, or {}.
+    `refined`, `shot`, `seen`: capture, photograph and its pixels after the calibration by the fit.
     """
-    (before, own), (capture, shot) = given, refined
-    assert own.window
-    image = reduced_image(own.whole, partial(read_photograph, own.whole, before.path), own.window)
-    seen = observed(shot, image, None, None, 1)
-    vertices, material = ring(s)
-    glossy = {name: torch.zeros_like(material[name]) for name in SPECULAR if name in material}
     pictures = []
-    for attributes in (material, material | glossy):
-        surface.write(vertices, attributes)
-        rgb, coverage = prediction.draw(surface, Photographs.of([shot], capture.room), 1, shadows=capture.shadows,
+    for factor in (0, 1):
+        surface.write_arrays({f"vertex_{name}": to_drjit(factor * value) for name, value in highlights.items()})
+        rgb, coverage = prediction.draw(surface, Photographs.of([shot], refined.room), 1, shadows=refined.shadows,
                                         indirect=ring.indirect)  # fmt: skip
         pictures.append(rgb[0].numpy())
-    full, diffuse = pictures
-    inside = ndimage.binary_erosion(coverage[0].numpy() > 0.99, np.ones((5, 5)))
-    clipped = ndimage.binary_dilation(seen.clipped[0].numpy().any(-1), np.ones((3, 3)))
-    typical = float(np.median(diffuse[inside])) if inside.any() else 1.0
-    usable = inside & ~clipped & (diffuse > DARK * typical).all(-1) & (full - diffuse <= GLOSSY * full).all(-1)
-    observed_diffuse = seen.rgb[0].numpy() - (full - diffuse)
-    ratio = np.maximum(observed_diffuse, 1e-3 * typical) / np.maximum(diffuse, 1e-3 * typical)
-    return np.log(ratio).clip(-LARGEST, LARGEST), usable
+    diffuse, full = pictures
+    inside = ndimage.binary_erosion(seen.surely(coverage)[0].numpy(), SQUARE)
+    lit = diffuse[inside][diffuse[inside] > 0]
+    typical = float(np.median(lit)) if len(lit) else 1.0
+    usable = inside & ~seen.clipped[0].numpy().any(-1)
+    usable &= ((diffuse > DARK * typical) & (full - diffuse <= GLOSSY * full)).all(-1)
+    ratio = np.maximum(seen.rgb[0].numpy() - (full - diffuse), 1e-3 * typical) / np.maximum(diffuse, 1e-3 * typical)
+    return np.log(ratio).clip(-LARGEST, LARGEST), ndimage.binary_erosion(usable, SQUARE)
 
 
 class Points(NamedTuple):
@@ -147,7 +157,7 @@ class Points(NamedTuple):
 
 def bilinear(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Interpolate a picture (H, W, C) at pixel coordinates (N, 2): (N, C) float32. All must be inside it."""
-    rows = -(-len(pixels) // 4096)
+    rows = max(1, -(-len(pixels) // 4096))  # OpenCV takes no empty arrays
     maps = np.full((2, rows * 4096), 0.5, np.float32)
     maps[:, : len(pixels)] = pixels.T - 0.5
     across, down = maps.reshape(2, rows, 4096)
@@ -189,20 +199,23 @@ def interpolated(grid: Grid, s: torch.Tensor, nodes: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def sharpened(
-    before: Capture, refined: Capture, ring: FittedObject, fitted: Sequence[int] | np.ndarray, width: int
-) -> FittedObject:
+    before: Capture, refined: Capture, surface: Surface, ring: FittedObject, fitted: Sequence[int] | np.ndarray,
+    width: int,
+) -> FittedObject:  # fmt: skip
     """Return a copy of an object whose colours have a texture from larger photographs, or the object itself.
 
-    It is the object itself if no photograph is larger than the fit has seen it, or if they show nothing finer.
-    `before`, `refined`: the capture before and after the calibration by the fit. `fitted`: indices of the photographs
-    to use. `width`: of the photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
+    It is the object itself if no photograph is larger than the fit has seen it, if they show nothing finer, or if the
+    material has no albedo. `before`, `refined`: the capture before and after the calibration by the fit. `surface`:
+    shows the object `ring`, in the light of the fit. `fitted`: indices of the photographs to use. `width`: of the
+    photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
     widest = texture_width(before, fitted, width)
-    if not widest or not is_registered(ring.brdf_net):
+    if not widest or not albedo_of(ring.brdf_net):
         return ring
     s, faces = ring.domain.sample(ring.subdivisions)
-    vertices, _ = ring(s.to(ring.center.device))
+    vertices, material = ring(s.to(ring.center.device))
     vertices = vertices.cpu().numpy()
+    highlights = {name: material[name] for name in SPECULAR if name in material}
     shots = {k: at_width(before.shots[k], refined.shots[k], widest) for k in fitted if before.shots[k].files.filename}
     eyes = {k: shot.camera.position for k, (_, shot) in shots.items()}
     middle = ring.center.cpu().numpy()
@@ -218,28 +231,27 @@ def sharpened(
     normals = points.at(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     visibility = Visibility(vertices, faces, [])
-    surface = Surface(refined.scene, refined.shape, ring)
-    surface.set_faces(faces)
     ratios = Ratios(len(places))
     for number, (k, (own, shot)) in enumerate(progress(shots.items(), "fine texture", len(shots))):
-        logarithms, usable = ratio_picture(surface, ring, s.to(ring.center.device), (before, own), (refined, shot))
+        seen = enlarged(before, k, own, shot)
+        logarithms, usable = ratio_picture(surface, ring, highlights, refined, shot, seen)
         view = MaskedCamera(shot.camera, usable.astype(np.uint8) * 255)
-        shown = np.flatnonzero(visibility.seen_by(view, places, normals))
-        pixels, _ = shot.camera.project(places[shown].astype(float))
-        away = eyes[k] - places[shown]
+        visible = np.flatnonzero(visibility.seen_by(view, places, normals))
+        pixels, _ = shot.camera.project(places[visible].astype(float))
+        away = eyes[k] - places[visible]
         distance = np.linalg.norm(away, axis=1)
-        cosine = ((normals[shown] * away).sum(1) / distance).clip(0, 1)
+        cosine = ((normals[visible] * away).sum(1) / distance).clip(0, 1)
         weight = cosine**SLANT / (resolution * distance / shot.camera.focal.mean()) ** 2
-        ratios.add(number % 2, shown, bilinear(logarithms.astype(np.float32), pixels), weight.astype(np.float32))
+        ratios.add(number % 2, visible, bilinear(logarithms.astype(np.float32), pixels), weight.astype(np.float32))
     values, weights = agreed(ratios, Grid.around(at, COARSE * widest / width / stretch / resolution, 1, 3), at)
     if values is None:
         return ring
-    seen = weights > 0
-    grid = Grid.around(at[seen], CELL / stretch / resolution, 1, 3)
+    shown = weights > 0
+    grid = Grid.around(at[shown], CELL / stretch / resolution, 1, 3)
     nodes = np.zeros((len(grid.keys(0)), 3), np.float32)
     for _ in range(SOLVING):  # of values whose interpolation has these means
-        missing = values[seen] - interpolated(grid, at[seen], nodes)
-        nodes += mean_around(grid, at[seen], missing, weights[seen])
+        missing = values[shown] - interpolated(grid, at[shown], nodes)
+        nodes += mean_around(grid, at[shown], missing, weights[shown])
     grid.values[0].copy_(torch.from_numpy(nodes))
     return FittedObject(
         ring.center, float(ring.radius), domain=ring.domain, bsdf=ring.bsdf, indirect=ring.indirect, up=ring.up,

@@ -41,7 +41,8 @@ def result_of(
 
     if course.iteration == schedule.iterations and schedule.stages[-1].detail and problem.config.detail != "shape":
         try:
-            ring = sharpened(capture, refined, ring, problem.fitted, max(problem.config.widths))
+            shown = renderer.show(model, ring.subdivisions)
+            ring = sharpened(capture, refined, shown, ring, problem.fitted, max(problem.config.widths))
         except InputError as error:  # a file has gone; all else can be saved
             print(f"There is no texture from larger photographs: {error}")
     return FitResult(

@@ -239,9 +239,9 @@ def predicted(result: FitResult, surface: Surface, index: np.ndarray) -> list[Pr
 
 def white(ring: FittedObject) -> dict[str, float]:
     """Return for each BSDF parameter the value that the report shows as white. The surface has hardly any above it."""
-    material = ring.material(ring.domain.sample(min(WHITE_LEVEL, ring.subdivisions))[0])
+    material = ring.material(ring.domain.sample(min(WHITE_LEVEL, ring.subdivisions))[0].to(ring.center.device))
     parameters = ring.brdf_net.bsdf_parameters
-    largest = {p: float(np.quantile(material[p.name].detach().cpu().numpy(), 0.99)) for p in parameters}
+    largest = {p: float(np.quantile(material[p.name].numpy(force=True), 0.99)) for p in parameters}
     return {p.name: max(value, p.low + 1e-6) for p, value in largest.items()}
 
 

@@ -14,7 +14,8 @@ from tqdm import tqdm
 
 Progress = Callable[..., Iterable]  #: the type of `progress`, and of substitutes that show nothing
 DELAY, LOG_INTERVAL = 2.0, 30.0  #: seconds before the first line in a log, and between two lines
-KNOWN = 0.1  #: share of the work whose time tells how long the rest will take
+KNOWN = 0.1  #: share of the work, or of a part, whose time tells how long the rest will take
+SMALL = 0.05  #: a part with less of the work than this does not tell how long the rest will take
 WITHIN_STEPS = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}"  #: a bar without a time of its own
 
 
@@ -170,10 +171,11 @@ class Steps:
         """
         here = self.parts[max(0, self.place)][1].seconds
         ahead = sum(part.seconds for _, part in self.parts[self.place + 1 :])
+        work = self.done + here + ahead
         passed = time.monotonic() - self.started - self.before  # in this part
-        if self.done > KNOWN * (self.done + here + ahead):
+        if self.done > KNOWN * work:
             total = passed + (1 - share) * here * self.before / self.done
-        elif share >= KNOWN:
+        elif share >= KNOWN and here > SMALL * work:
             total = passed / share
         else:
             return None
