@@ -44,7 +44,7 @@ def plain(points):
 
 def photographed(folder, colours, count=12, surface=lambda points: points, width=160):
     """A scene file with photographs of a matte ball in a dark room, which Mitsuba's path tracer makes."""
-    ico = trimesh.creation.icosphere(7)
+    ico = trimesh.creation.icosphere(6)
     mesh = mi.Mesh("ball", len(ico.vertices), len(ico.faces), props=matte())
     params = mi.traverse(mesh)
     params["vertex_positions"] = surface(ico.vertices).ravel().astype(np.float32)
@@ -87,7 +87,7 @@ def render(mesh, camera, light):
             "intensity": {"type": "rgb", "value": light.rgb.tolist()}}  # fmt: skip
     scene = mi.load_dict({"type": "scene", "mesh": mesh, "camera": sensor, "lamp": lamp,
                           "integrator": {"type": "path", "max_depth": 2}})  # fmt: skip
-    return np.array(mi.render(scene, spp=64))[..., :3]
+    return np.array(mi.render(scene, spp=16))[..., :3]
 
 
 def pale_ball():
@@ -144,7 +144,7 @@ def test_a_ball_of_one_colour_keeps_it(tmp_path):
     def rippled(points):
         return points * (1 + 0.004 * np.sin(30 * points[:, :1]) * np.sin(28 * points[:, 1:2]))
 
-    capture = load_capture(photographed(tmp_path, plain, 24, rippled), width=40)
+    capture = load_capture(photographed(tmp_path, plain, 14, rippled), width=40)
     colours = reflectances(sharpened(capture, pale_ball()), on_the_ball())["diffuse"]
     assert (colours / MATTE).std(0).max() < 0.02
 
