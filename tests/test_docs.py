@@ -178,7 +178,7 @@ def test_the_python_of_the_pages_runs(small_capture, tmp_path, monkeypatch):
             for old, new in changed.items():
                 block = block.replace(old, new)
             exec(block, names)
-    assert (tmp_path / "out/mine/mesh.ply").is_file() and (tmp_path / "pot.png").is_file()
+    assert (tmp_path / "out/mine/mesh.ply").is_file() and (tmp_path / "out/pot.png").is_file()
     assert np.array(names["scene"].bbox().extents()).max() > 0 and names["jacobian"].shape[1:] == (3, 3)
     assert np.abs(np.array(names["dr"].grad(names["params"]["007.to_world"]).matrix)).max() > 0
 

@@ -166,7 +166,7 @@ def test_published_figures():
 
 MISTAKES = [
     (["tabel1"], "NAME: is tabel1; must be one of table1, table2.*; perhaps you meant table1"),
-    ([], "NAME: is missing"),
+    ([], "NAME is missing"),
     (["table1", "nowhere"], "nowhere: DATA: no such file or folder; table1 takes folders of captures"),
     (["table1", "--seeds", "1", "1"], "--seeds: is 1 1, must be different"),
     (["table1", "--seeds", "x"], r"--seeds: is x, must be INT \[INT \.\.\.\]"),
