@@ -34,11 +34,11 @@ from mi_ring.scene.shot import Shot, Window
 from mi_ring.scene.visibility import MaskedCamera, Visibility
 from mi_ring.system.progress import progress
 
-WIDEST = 2048  #: to which photographs are reduced for the texture [px]
+WIDEST = 1024  #: to which photographs are reduced for the texture [px]
 WORTH = 1.3  #: the photographs must be wider than those of the fit by this factor
 CELL, SOLVING = 1.0, 4  #: side of the cubes of the texture [px]; steps to find the values of their corners
 COARSE = 8.0  #: differences that are coarser than this are left out [px of the fit]
-MOST_POINTS = 6_000_000
+MOST_POINTS = 2_000_000
 DARK, GLOSSY = 0.03, 0.5  #: least prediction [median of the object], and largest share of highlights in it
 LARGEST = 1.5  #: largest change of a colour, as a logarithm
 SQUARE = np.ones((3, 3))  #: a pixel and its neighbours

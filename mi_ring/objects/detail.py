@@ -52,8 +52,10 @@ class Grid(nn.Module):
         """Make a grid whose cubes contain the points (V, 3)."""
         keys = []
         for k in reversed(range(octaves)):
-            cubes = torch.unique(keys_of(torch.floor(points.double() / (cell * 2**k))))
-            keys.append(torch.unique(cubes[:, None] + CORNERS @ PLACES))
+            corners = keys_of(torch.floor(points.double() / (cell * 2**k))).unique()
+            for step in PLACES:  # along one axis after the other, so that there are never eight for each cube
+                corners = torch.cat([corners, corners + step]).unique()
+            keys.append(corners)
         grid = cls(cell, [len(own) for own in keys], channels)
         for k, own in enumerate(keys):
             grid.keys(k).copy_(own)
