@@ -138,9 +138,10 @@ def flash_report(flash: FlashCalibration, sparse: SparseModel, found: SegmentedO
 
 
 def steps_of(pictures: Path) -> list[list[Part]]:
-    """List the steps of the command, with seconds that fit to measurements: see `docs/background/performance.md`.
+    """List the steps of the command, and how many seconds each part is likely to take.
 
-    `pictures`: folder of the photographs. 58 photographs of 0.8 megapixels and 80 of 13 megapixels were measured.
+    `pictures`: folder of the photographs. The times are those of 58 photographs of 0.8 megapixels and of 80 of 13
+    megapixels, and of others in proportion.
     """
     files = [file for file in sorted(pictures.glob("[!.]*")) if file.suffix.lower() in SUFFIXES]
     count, size = max(3, len(files)), 1e6

@@ -22,7 +22,7 @@ from mi_ring.capture.decoding import read_photograph
 from mi_ring.capture.observation import Observation, observed
 from mi_ring.capture.reduction import reduced_image, windowed
 from mi_ring.geometry.meshes import area_vectors
-from mi_ring.objects.detail import AT_ONCE, Grid
+from mi_ring.objects.detail import Grid
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import SPECULAR
 from mi_ring.objects.sharpened_material import SharpenedMaterial, albedo_of
@@ -170,31 +170,13 @@ def mean_around(grid: Grid, s: torch.Tensor, values: np.ndarray, weights: np.nda
 
     The grid has one octave. `weights` (N,).
     """
-    nodes = len(grid.keys(0))
-    sums, total = np.zeros((nodes, values.shape[1])), np.zeros(nodes)
-    for first in range(0, len(s), AT_ONCE):
-        part = slice(first, first + AT_ONCE)
-        share, place = (x.numpy() for x in grid.octave_weights(s[part], 0))
-        share = share * weights[part, None]
-        total += np.bincount(place.ravel(), share.ravel(), nodes)
-        for c in range(values.shape[1]):
-            sums[:, c] += np.bincount(place.ravel(), (share * values[part, c, None]).ravel(), nodes)
-    return (sums / np.maximum(total, 1e-12)[:, None]).astype(np.float32)
+    (shares,) = grid.weights(s)
+    return shares.T @ (values * weights[:, None]) / np.maximum(shares.T @ weights, 1e-12)[:, None]
 
 
 def smoothed(grid: Grid, s: torch.Tensor, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return values (N, C) of points `s` (N, 3) as a grid of one octave represents them."""
-    return interpolated(grid, s, mean_around(grid, s, values, weights))
-
-
-def interpolated(grid: Grid, s: torch.Tensor, nodes: np.ndarray) -> np.ndarray:
-    """Interpolate values (nodes, C) of the corners of a grid of one octave at points `s` (N, 3): (N, C)."""
-    result = np.empty((len(s), nodes.shape[1]), np.float32)
-    for first in range(0, len(s), AT_ONCE):
-        part = slice(first, first + AT_ONCE)
-        share, place = (x.numpy() for x in grid.octave_weights(s[part], 0))
-        result[part] = np.einsum("nk,nkc->nc", share, nodes[place])
-    return result
+    """Return values (N, C) of points `s` (N, 3) as a grid of one octave represents them. `weights` (N,)."""
+    return grid.weights(s)[0] @ mean_around(grid, s, values, weights)
 
 
 @torch.no_grad()
@@ -247,12 +229,13 @@ def sharpened(
     if values is None:
         return ring
     shown = weights > 0
-    grid = Grid.around(at[shown], CELL / stretch / resolution, 1, 3)
-    nodes = np.zeros((len(grid.keys(0)), 3), np.float32)
-    for _ in range(SOLVING):  # of values whose interpolation has these means
-        missing = values[shown] - interpolated(grid, at[shown], nodes)
-        nodes += mean_around(grid, at[shown], missing, weights[shown])
+    at, values, weights = at[shown], values[shown], weights[shown]
+    grid = Grid.around(at, CELL / stretch / resolution, 1, 3)
+    (shares,), nodes = grid.weights(at), np.zeros((len(grid.keys(0)), 3), np.float32)
+    for _ in range(SOLVING):  # for values of the corners whose interpolation is `values`
+        nodes += mean_around(grid, at, values - shares @ nodes, weights)
     grid.values[0].copy_(torch.from_numpy(nodes))
+    grid.latest.clear()  # the weights take more memory than the values
     return FittedObject(
         ring.center, float(ring.radius), domain=ring.domain, bsdf=ring.bsdf, indirect=ring.indirect, up=ring.up,
         subdivisions=ring.subdivisions, ground=ring.ground, metres=ring.metres,

@@ -23,7 +23,7 @@ from mi_ring.system.machine import release_memory
 CORNERS = torch.tensor(list(itertools.product((0, 1), repeat=3)))  #: (8, 3) of a cube
 AT_ONCE = 2**16  #: points whose weights are computed at once
 PART = 2**20  #: points whose weights are kept: more than a mesh of a fit has, fewer than one to export may have
-#: Changes of highlights by those of colours. Few photographs show a highlight, so larger changes do not suit others.
+#: Factor of what details add to gloss. Few photographs show a highlight: a larger change would not suit the others.
 GLOSS = 1 / 3
 MOST = 2**20  #: coordinates of cubes are from -`MOST` to `MOST` - 1
 PLACES = torch.tensor([2**42, 2**21, 1])  #: a key is the scalar product of these and of coordinates from -`MOST`

@@ -250,7 +250,7 @@ def panels_of(
 ) -> list[tuple[PhotographPanel, float]]:
     """Compare photographs with their predictions. Returns (panel, mean squared sRGB error) for each, in this order.
 
-    `white`: as the function of this name returns it. `index` (n,): indices of the photographs. `predictions`: their n
+    `white`: result of the function `white`. `index` (n,): indices of the photographs. `predictions`: their n
     rendered predictions.
     """
     return [panel_of(result, white, int(k), prediction) for k, prediction in zip(index, predictions)]
@@ -261,7 +261,7 @@ def panel_of(
 ) -> tuple[PhotographPanel, float]:
     """Compare photograph `k` with its prediction. Returns (panel for the report, mean squared sRGB error).
 
-    `white`: as the function of this name returns it.
+    `white`: result of the function `white`.
 
     The error is the mean over all valid pixels. If the room was lit and the photograph has a mask, it is the mean over
     the valid pixels in the mask.
