@@ -5,7 +5,7 @@
 CAPTURE is one that `detail_captures.py` has written, RUN a results folder, or a mesh with diffuse colours. In each
 photograph's exact camera the maps of normals and of diffuse colour are compared with the true ones, where both surfaces
 are seen at less than 60°. Colours are compared after one scale per channel, in % of the mean colour. Novel views are
-compared inside the object.
+compared inside the object. A fit with a texture finer than its mesh gets a second column, with this texture.
 
 Prints a Markdown table with a column for each RUN, and then one line of JSON. The row "none" of a band is the error of
 a fit that has nothing in this band.
@@ -22,7 +22,10 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb
 from mi_ring.objects.ring_file import load_fit
+from mi_ring.objects.sharpened_material import SharpenedMaterial
+from mi_ring.output.atlas import reflectances
 from mi_ring.rendering import prediction
+from mi_ring.rendering.bridge import to_drjit
 from mi_ring.rendering.image_formation import render_maps
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
@@ -32,6 +35,7 @@ from mi_ring.scene.shot import Shot
 import cv2
 import mitsuba as mi
 import numpy as np
+import torch
 from accuracy import table
 from scipy.ndimage import gaussian_filter, map_coordinates
 from tqdm import tqdm
@@ -63,14 +67,20 @@ def averaged(values: np.ndarray) -> np.ndarray:
 
 
 class Maps:
-    """Maps of a surface and of its diffuse colour: those of a mesh file, or of a results folder as it is rendered."""
+    """Maps of a surface and of its diffuse colour: those of a mesh file, or of a results folder.
 
-    def __init__(self, path: Path, capture: Capture) -> None:
-        self.surface, self.ring = None, None
+    `textured`: with the texture of the fit that is finer than its mesh, instead of the colours of the vertices.
+    """
+
+    def __init__(self, path: Path, capture: Capture, textured: bool = False) -> None:
+        self.surface, self.ring, self.textured = None, None, textured
         if path.is_dir():
             self.ring = load_fit(path)
             self.surface = Surface(capture.scene, capture.shape, self.ring)
-            self.surface.show(self.ring, *self.ring.domain.sample(self.ring.subdivisions))
+            self.s, faces = self.ring.domain.sample(self.ring.subdivisions)
+            self.surface.show(self.ring, self.s, faces)
+            with torch.no_grad():
+                self.material = self.ring.material(self.s)
         else:
             self.scene = mi.load_dict({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
 
@@ -80,12 +90,40 @@ class Maps:
         if self.surface is not None:
             found = prediction.maps(self.surface, view)
             normal, diffuse = found["normal"][0], found["diffuse"][0]
+            if self.textured:
+                diffuse = self.texture(view)
         else:
             channels = np.stack([np.array(c) for c in render_maps(self.scene, view, {"vertex_diffuse": 3})], -1)
             normal, diffuse = np.split(channels.reshape(*view.shape[1:], 6), 2, -1)
         seen = averaged((np.abs(normal).sum(-1, keepdims=True) > 0).astype(np.float32))[..., 0] > 0.999
         normal = averaged(normal)
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9), averaged(diffuse), seen
+
+    def texture(self, view: Photographs) -> np.ndarray:
+        """The diffuse colour (H, W, 3) of the texture: domain points are rendered in the place of colours."""
+        self.surface.write_arrays({"vertex_diffuse": to_drjit(self.s)})
+        s = prediction.maps(self.surface, view)["diffuse"][0]
+        self.surface.write_arrays({"vertex_diffuse": to_drjit(self.material["diffuse"])})
+        colours, inside = np.zeros_like(s), np.abs(s).sum(-1) > 0
+        colours[inside] = reflectances(self.ring, s[inside])["diffuse"]
+        return colours
+
+    def photograph(self, capture: Capture, k: int) -> np.ndarray:
+        """The predicted linear radiance (H, W, 3) of a photograph."""
+
+        def drawn() -> np.ndarray:
+            return prediction.draw(self.surface, capture.photograph(k), shadows=capture.shadows,
+                                   indirect=self.ring.indirect)[0][0].numpy()  # fmt: skip
+
+        full = drawn()
+        if not self.textured:
+            return full
+        self.surface.write_arrays({"vertex_specular": to_drjit(0 * self.material["specular"])})
+        diffuse = drawn()
+        self.surface.write_arrays({"vertex_specular": to_drjit(self.material["specular"])})
+        view = finer(capture.shots[k].camera)
+        fine, coarse = averaged(self.texture(view)), averaged(prediction.maps(self.surface, view)["diffuse"][0])
+        return full + diffuse * (fine / np.maximum(coarse, 1e-9) - 1)
 
 
 def smoothed(picture: np.ndarray, inside: np.ndarray, wavelength: float) -> np.ndarray:
@@ -187,11 +225,9 @@ def novel_errors(maps: Maps, novel: Capture) -> dict[str, float]:
     """PSNR [dB] of predicted novel views inside the object, of all and of what is finer than `FINE` pixels."""
     squares = []
     for k in range(len(novel)):
-        rgb, _ = prediction.draw(maps.surface, novel.photograph(k), shadows=novel.shadows, indirect=maps.ring.indirect)
         seen = novel.observe([k])
-        a, b = (
-            linear_to_srgb(np.clip(recorded(p, novel.shots[k]), 0, 1)) for p in (rgb[0].numpy(), seen.rgb[0].numpy())
-        )
+        a, b = (linear_to_srgb(np.clip(recorded(picture, novel.shots[k]), 0, 1))
+                for picture in (maps.photograph(novel, k), seen.rgb[0].numpy()))  # fmt: skip
         inside = seen.mask[0].numpy() > 0.99
         fine = (a - b) - smoothed(a - b, inside, FINE)
         squares.append([np.square(d[inside]).mean() for d in (a - b, fine)])
@@ -209,15 +245,18 @@ def main() -> None:
     exact = next(file for file in (options.capture / "exact.xml", options.capture / "scene.xml") if file.is_file())
     capture = load_capture(exact, images=False)
     true, columns = Maps(truth / "mesh.ply", capture), {}
-    found = {run: (Maps(run, capture), Comparison()) for run in options.runs}
+    found = {str(run): (Maps(run, capture), Comparison()) for run in options.runs}
+    for run, (maps, _) in list(found.items()):
+        if maps.ring is not None and isinstance(maps.ring.brdf_net, SharpenedMaterial):
+            found[f"{run}, texture"] = Maps(Path(run), capture, textured=True), Comparison()
     for shot in tqdm(capture.shots, disable=None):
         expected = true.of(shot.camera)
         for maps, comparison in found.values():
             comparison.add(maps.of(shot.camera), expected, shot.camera)
     for run, (maps, comparison) in found.items():
-        columns[str(run)] = comparison.numbers()
+        columns[run] = comparison.numbers()
         if maps.ring is not None and (truth / "scene.xml").is_file():
-            columns[str(run)] |= novel_errors(maps, load_capture(truth / "scene.xml"))
+            columns[run] |= novel_errors(maps, load_capture(truth / "scene.xml"))
     names = dict.fromkeys(name for numbers in columns.values() for name in numbers)
     values = ((name, [numbers.get(name) for numbers in columns.values()]) for name in names)
     rows = [[name, *("-" if value is None else f"{value:.2f}" for value in row)] for name, row in values]

@@ -13,17 +13,15 @@ from mi_ring.capture.observation import Observation
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting import fine_texture
+from mi_ring.fitting.surface_ratios import LowPass, Points, Ratios, bilinear
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.nets.brdf_net import BRDFNet, Parameter
-from mi_ring.objects.detail import Grid
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import EditedMaterial
 from mi_ring.objects.ring_file import compact, ring_of, ring_state
 from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.output.atlas import reflectances
-from mi_ring.rendering import prediction
-from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Files, Response, Shot
@@ -186,21 +184,21 @@ def test_highlights_are_subtracted_and_strong_ones_left_out(print_scene):
     capture, ring = load_capture(print_scene, width=160), pale_ball()
     with torch.no_grad():
         [p for p in ring.brdf_net.parameters() if p.shape == (5,)][-1][3:] = torch.tensor([0.0, -2.0])
+        surface, shot = Surface(capture.scene, capture.shape, ring), capture.shots[0]
         s, faces = ring.domain.sample(5)
-        vertices, material = ring(s)
-    surface, shot = Surface(capture.scene, capture.shape, ring), capture.shots[0]
-    surface.set_faces(faces)
-    pictures = []
-    for specular in (torch.zeros(len(s)), material["specular"]):
-        surface.write(vertices, material | {"specular": specular})
-        rgb, coverage = prediction.draw(surface, Photographs.of([shot]), 1)
-        pictures.append(rgb)
-    diffuse, full = pictures
-    seen = Observation(full + diffuse, torch.zeros_like(full, dtype=torch.bool), coverage, torch.tensor([False]), None)
-    highlights = {"specular": material["specular"]}
-    logarithms, usable = fine_texture.ratio_picture(surface, ring, highlights, capture, shot, seen)
-    strong = (full - diffuse > diffuse).any(-1)[0].numpy()
-    assert usable.sum() > 1000 and strong.sum() > 20 and not (strong & usable).any()
+        surface.show(ring, s, faces)
+        predicted = fine_texture.Predictor(surface, ring, capture).of(shot)
+    highlights, diffuse = (torch.from_numpy(picture[None, ..., :3])
+                           for picture in (predicted.highlights, predicted.diffuse))  # fmt: skip
+    whole = torch.zeros(diffuse.shape, dtype=torch.bool)
+    mask = torch.ones(whole.shape[:3])
+    seen = Observation(highlights + 2 * diffuse, whole, mask, torch.tensor([False]), None)
+    points = Points.of(faces, 1)
+    triangles = np.flatnonzero(predicted.seen[faces].all(1))
+    logarithms, usable = fine_texture.ratios_of(predicted, seen, points, triangles, predicted.pixels)
+    at = points.at(predicted.pixels, triangles)[:, 0]
+    strong = bilinear((highlights > diffuse).any(-1)[0].numpy().astype(np.float32)[..., None], at)[:, 0] == 1
+    assert usable.sum() > 1000 and strong.sum() > 20 and not (strong & usable[:, 0]).any()
     np.testing.assert_allclose(logarithms[usable], np.log(2), atol=1e-3)
 
 
@@ -215,46 +213,87 @@ def test_photographs_are_decoded_with_the_curve_that_the_fit_has_found(print_sce
     np.testing.assert_allclose(curved.rgb, plain.rgb**0.5, atol=2e-3)
 
 
+def halves(shown, photographs=8):
+    """Ratios at the points of a ball of what `shown(points (N, 3))` returns for each photograph, with its low-pass."""
+    s, faces = FittedObject(np.zeros(3), 1.0).domain.sample(5)
+    ratios = Ratios(Points.of(faces, 2))
+    places = ratios.points.at(s.numpy())
+    for photograph in range(photographs):
+        ratios.add(photograph % 2, np.arange(len(faces)), shown(places), np.ones(places.shape[:2], np.float32))
+    return ratios, LowPass(ratios.points, s, 0.2), places
+
+
 def test_noise_alone_is_no_texture():
     random = np.random.default_rng(1)
-    s = torch.from_numpy(on_the_ball(20000))
-    coarse = Grid.around(s, 0.2, 1, 3)
-    ratios = fine_texture.Ratios(len(s))
-    for photograph in range(8):
-        noise = random.normal(0, 0.3, (len(s), 3)).astype(np.float32)
-        ratios.add(photograph % 2, np.arange(len(s)), noise, np.ones(len(s), np.float32))
-    assert fine_texture.agreed(ratios, coarse, s)[0] is None
+    ratios, low_pass, _ = halves(lambda places: random.normal(0, 0.3, places.shape))
+    assert ratios.agreed(low_pass) is None
 
 
 def test_what_both_halves_show_is_taken_but_not_what_is_coarse():
     random = np.random.default_rng(1)
-    s = torch.from_numpy(on_the_ball(40000))
-    x = s[:, :1].numpy()
-    fine, broad = 0.3 * np.sin(60 * x), 0.5 * x
-    ratios = fine_texture.Ratios(len(s))
-    for photograph in range(8):
-        shown = fine + broad + random.normal(0, 0.3, (len(s), 3))
-        ratios.add(photograph % 2, np.arange(len(s)), shown.astype(np.float32), np.ones(len(s), np.float32))
-    values, _ = fine_texture.agreed(ratios, Grid.around(s, 0.2, 1, 3), s)
+
+    def waves(places):
+        return 0.3 * np.sin(60 * places[..., :1])
+
+    ratios, low_pass, places = halves(
+        lambda places: waves(places) + 0.5 * places[..., :1] + random.normal(0, 0.3, places.shape)
+    )
+    values, fine = ratios.agreed(low_pass), waves(places)
     # Wiener's filter: of the mean of eight, noise has 0.3² / 8, the waves have 0.3² / 2.
     share = 0.5 / (0.5 + 1 / 8)
     assert (values * fine).sum() / (3 * (fine**2).sum()) == pytest.approx(share, abs=0.08)
-    assert abs((values * x).sum() / (3 * (x**2).sum())) < 0.03
+    assert abs((values * places[..., :1]).sum() / (3 * np.square(places[..., 0]).sum())) < 0.03
 
 
-@pytest.mark.parametrize("divisions", [0, 1, 3])
+def test_the_mean_colour_of_a_print_stays():
+    """A part is ink, a fifth as bright as the paper."""
+
+    def printed_at(places):
+        return np.sin(60 * places[..., :1]) * np.sin(65 * places[..., 1:2] + 1) > 0.4
+
+    def shown(places):
+        ratios = np.where(printed_at(places), 0.2, 1)
+        return np.log(np.tile(ratios / ratios.mean(), 3))
+
+    ratios, low_pass, places = halves(shown)
+    found, ink = np.exp(ratios.agreed(low_pass))[..., 0], printed_at(places)[..., 0]
+    assert np.median(found[~ink]) / np.median(found[ink]) == pytest.approx(5, rel=0.02)
+    assert found.mean() == pytest.approx(1, abs=0.01)
+
+
+def test_a_grid_represents_what_points_show():
+    """Waves of 0.1 on cubes of 0.02, seen at some triangles only."""
+    s, faces = FittedObject(np.zeros(3), 1.0).domain.sample(5)
+    ratios = Ratios(Points.of(faces, 3))
+    places = ratios.points.at(s.numpy())
+    waves = np.sin(2 * np.pi / 0.1 * places) * [0.2, 0.3, 0.1]
+    some = np.flatnonzero(places[:, 0, 2] > 0.2)
+    for half in range(2):
+        ratios.add(half, some, waves[some], np.full((len(some), 9), 0.5 + half, np.float32))
+    grid = ratios.texture(s, 0.5, 0.02)
+    inside = places[:, 0, 2] > 0.3
+    with torch.no_grad():
+        found = grid(torch.from_numpy(places[inside].reshape(-1, 3))).numpy()
+        assert not grid(torch.tensor([[0.0, 0.0, -1.0]])).any()
+    np.testing.assert_allclose(found.std(0), waves[inside].std((0, 1)), rtol=0.05)
+    assert np.abs(found - waves[inside].reshape(-1, 3)).mean() < 0.02
+
+
+@pytest.mark.parametrize("divisions", [1, 2, 5])
 def test_points_divide_triangles_evenly(divisions):
     faces = np.array([[0, 1, 2], [2, 1, 3]])
     vertices = np.array([[0, 0, 0], [1, 0, 0.5], [0, 2, 1], [3, 3, 0]])
-    points = fine_texture.Points.of(faces, divisions)
+    points = Points.of(faces, divisions)
     places = points.at(vertices)
-    assert len(places) == 2 * 4**divisions == len(np.unique(places.round(5), axis=0))
+    assert places.shape == (2, divisions**2, 3)
+    assert len(np.unique(places.reshape(-1, 3).round(5), axis=0)) == 2 * divisions**2
+    np.testing.assert_array_equal(points.at(vertices, np.array([1])), places[1:])
     np.testing.assert_allclose(points.shares.sum(1), 1, rtol=1e-6)
-    np.testing.assert_allclose(places.reshape(2, -1, 3).mean(1), vertices[faces].mean(1), rtol=1e-5)
-    # The second moment of points at the centres of 4ᵈ equal parts: that of the triangle, less that of a part.
-    spread = np.square(places.reshape(2, -1, 3) - vertices[faces].mean(1)[:, None]).sum(2).mean(1)
+    np.testing.assert_allclose(places.mean(1), vertices[faces].mean(1), rtol=1e-5)
+    # The second moment of points at the centres of n² equal parts: that of the triangle, less that of a part.
+    spread = np.square(places - vertices[faces].mean(1)[:, None]).sum(2).mean(1)
     whole = np.square(vertices[faces] - vertices[faces].mean(1)[:, None]).sum((1, 2)) / 12
-    np.testing.assert_allclose(spread, whole * (1 - 0.25**divisions), rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(spread, whole * (1 - divisions**-2), rtol=1e-4, atol=1e-12)
 
 
 def test_a_picture_is_interpolated_linearly():
@@ -262,5 +301,5 @@ def test_a_picture_is_interpolated_linearly():
     picture = np.stack([x, 3 * y, x - y], -1).astype(np.float32)
     at = np.random.default_rng(0).uniform([1, 1], [29, 19], (5000, 2))
     expected = np.stack([at[:, 0], 3 * at[:, 1], at[:, 0] - at[:, 1]], -1)
-    assert fine_texture.bilinear(picture, at[:0]).shape == (0, 3)
-    np.testing.assert_allclose(fine_texture.bilinear(picture, at), expected, atol=0.12)  # OpenCV has 32 steps a pixel
+    assert bilinear(picture, at[:0]).shape == (0, 3)
+    np.testing.assert_allclose(bilinear(picture, at), expected, atol=0.12)  # OpenCV has 32 steps a pixel

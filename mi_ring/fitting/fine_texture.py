@@ -15,14 +15,13 @@ import cv2
 import numpy as np
 import torch
 import trimesh
-from scipy import ndimage
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import read_photograph
 from mi_ring.capture.observation import Observation, observed
 from mi_ring.capture.reduction import reduced_image, windowed
+from mi_ring.fitting.surface_ratios import Points, Ratios, bilinear
 from mi_ring.geometry.meshes import area_vectors
-from mi_ring.objects.detail import Grid
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import SPECULAR
 from mi_ring.objects.sharpened_material import SharpenedMaterial, albedo_of
@@ -32,18 +31,19 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.scene.visibility import MaskedCamera, Visibility
+from mi_ring.system.machine import pipelined
 from mi_ring.system.progress import progress
 
-WIDEST = 1024  #: to which photographs are reduced for the texture [px]
+WIDEST = 2048  #: to which photographs are reduced for the texture [px]
+PREDICTED = 1024  #: largest width of a prediction, which shows nothing finer than the fit [px]
 WORTH = 1.3  #: the photographs must be wider than those of the fit by this factor
-CELL, SOLVING = 1.0, 4  #: side of the cubes of the texture [px]; steps to find the values of their corners
+CELL = 1.2  #: side of the cubes of the texture [px]
 COARSE = 8.0  #: differences that are coarser than this are left out [px of the fit]
-MOST_POINTS = 2_000_000
+MOST_POINTS = 8_000_000
 DARK, GLOSSY = 0.03, 0.5  #: least prediction [median of the object], and largest share of highlights in it
 LARGEST = 1.5  #: largest change of a colour, as a logarithm
-SQUARE = np.ones((3, 3))  #: a pixel and its neighbours
+SQUARE = np.ones((3, 3), np.uint8)  #: a pixel and its neighbours
 SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
-CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have in common
 
 
 def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray, width: int) -> int:
@@ -87,96 +87,70 @@ def enlarged(before: Capture, k: int, own: Shot, shot: Shot) -> Observation:
     return observed(shot, image, mask, valid, 1)
 
 
-class Ratios:
-    """Means of the logarithms of ratios at N points of the surface, from each half of the photographs.
+class Prediction(NamedTuple):
+    """What is predicted for a photograph, and where in it the vertices are."""
 
-    `number`: N.
+    diffuse: np.ndarray  #: (h, w, 4) the picture without highlights, and which pixels are usable
+    highlights: np.ndarray  #: (h, w, 3) the picture's highlights
+    pixels: np.ndarray  #: (V, 2) the vertices in it
+    seen: np.ndarray  #: (V,) which vertices are seen
+
+
+class Predictor:
+    """Predicts photographs of a fitted object, with and without highlights.
+
+    `surface`: shows the object `ring`, in the light of the fit. `refined`: the capture after calibration by the fit.
     """
 
-    def __init__(self, number: int) -> None:
-        self.sums, self.weights = np.zeros((2, number, 3), np.float32), np.zeros((2, number), np.float32)
+    def __init__(self, surface: Surface, ring: FittedObject, refined: Capture) -> None:
+        self.surface, self.ring, self.refined = surface, ring, refined
+        self.s, self.faces = ring.domain.sample(ring.subdivisions)
+        vertices, material = ring(self.s.to(ring.center.device))
+        self.vertices = vertices.cpu().numpy()
+        self.normals = trimesh.Trimesh(self.vertices, self.faces, process=False).vertex_normals
+        self.visibility = Visibility(self.vertices, self.faces, [])
+        self.highlights = {name: material[name] for name in SPECULAR if name in material}
 
-    def add(self, half: int, points: np.ndarray, logarithms: np.ndarray, weights: np.ndarray) -> None:
-        """Add what a photograph shows. `points` (M,): indices. `logarithms` (M, 3). `weights` (M,)."""
-        self.sums[half, points] += logarithms * weights[:, None]
-        self.weights[half, points] += weights
+    def of(self, shot: Shot) -> Prediction:
+        """Predict a photograph. A pixel is usable if it and its neighbours show only the object, lit, no highlight."""
+        pictures = []
+        for factor in (0, 1):
+            self.surface.write_arrays({f"vertex_{k}": to_drjit(factor * v) for k, v in self.highlights.items()})
+            photographs = Photographs.of([shot], self.refined.room)
+            rgb, coverage = prediction.draw(self.surface, photographs, 1, shadows=self.refined.shadows,
+                                            indirect=self.ring.indirect)  # fmt: skip
+            pictures.append(rgb[0].numpy())
+        diffuse, full = pictures
+        inside = eroded(coverage[0].numpy() > 0.99)
+        lit = diffuse[inside][diffuse[inside] > 0]
+        least = DARK * np.median(lit) if len(lit) else 1.0
+        usable = inside & ((diffuse > least) & (full - diffuse <= GLOSSY * full)).all(-1)
+        seen = self.visibility.seen_by(MaskedCamera(shot.camera, None), self.vertices, self.normals)
+        pixels, _ = shot.camera.project(self.vertices)
+        return Prediction(np.dstack([diffuse, eroded(usable)]).astype(np.float32), full - diffuse, pixels, seen)
 
-    def means(self) -> np.ndarray:
-        """Return the mean (2, N, 3) of each half; 0 without photographs."""
-        return self.sums / np.maximum(self.weights, 1e-9)[..., None]
+
+def eroded(mask: np.ndarray) -> np.ndarray:
+    """Return a mask (H, W) bool without the pixels that have a neighbour outside it."""
+    return cv2.erode(mask.astype(np.uint8), SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-def ratio_picture(
-    surface: Surface, ring: FittedObject, highlights: dict[str, torch.Tensor], refined: Capture, shot: Shot,
-    seen: Observation,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Compare a photograph with its prediction. Returns (logarithms of ratios (H, W, 3), which are usable (H, W)).
+def ratios_of(predicted: Prediction, seen: Observation, points: Points, triangles: np.ndarray, pixels: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Compare a photograph with its prediction. Returns (logarithms of ratios (f, n, 3), which are usable (f, n)).
 
-    A pixel is usable if it and its neighbours show nothing but the object, lit, neither clipped nor in a highlight.
-
-    `surface`: shows the object `ring`. `highlights`: the parameter of its highlights (V,) or (V, 3) by name, or {}.
-    `refined`, `shot`, `seen`: capture, photograph and its pixels after the calibration by the fit.
+    A ratio is usable if photograph and prediction show there nothing but the object, lit, neither clipped nor in a
+    highlight. `seen`: the photograph. `pixels` (V, 2): the vertices in it. `points`: n points in each triangle.
+    `triangles` (f,): those to compare.
     """
-    pictures = []
-    for factor in (0, 1):
-        surface.write_arrays({f"vertex_{name}": to_drjit(factor * value) for name, value in highlights.items()})
-        rgb, coverage = prediction.draw(surface, Photographs.of([shot], refined.room), 1, shadows=refined.shadows,
-                                        indirect=ring.indirect)  # fmt: skip
-        pictures.append(rgb[0].numpy())
-    diffuse, full = pictures
-    inside = ndimage.binary_erosion(seen.surely(coverage)[0].numpy(), SQUARE)
-    lit = diffuse[inside][diffuse[inside] > 0]
-    typical = float(np.median(lit)) if len(lit) else 1.0
-    usable = inside & ~seen.clipped[0].numpy().any(-1)
-    usable &= ((diffuse > DARK * typical) & (full - diffuse <= GLOSSY * full)).all(-1)
-    ratio = np.maximum(seen.rgb[0].numpy() - (full - diffuse), 1e-3 * typical) / np.maximum(diffuse, 1e-3 * typical)
-    return np.log(ratio).clip(-LARGEST, LARGEST), ndimage.binary_erosion(usable, SQUARE)
-
-
-class Points(NamedTuple):
-    """Points between the vertices of a mesh, at the centres of equal parts of its triangles."""
-
-    corners: np.ndarray  #: (N, 3) vertices of the triangle
-    shares: np.ndarray  #: (N, 3) barycentric coordinates
-
-    @classmethod
-    def of(cls, faces: np.ndarray, divisions: int) -> "Points":
-        """Make 4^`divisions` points in each triangle of `faces` (F, 3)."""
-        triangles = np.eye(3)[None]
-        for _ in range(divisions):
-            middles = (triangles + np.roll(triangles, -1, 1)) / 2
-            corners = [np.stack([triangles[:, k], middles[:, k], middles[:, k - 1]], 1) for k in range(3)]
-            triangles = np.concatenate([*corners, middles])
-        centres = triangles.mean(1).astype(np.float32)
-        return cls(np.repeat(faces, len(centres), 0), np.tile(centres, (len(faces), 1)))
-
-    def at(self, values: np.ndarray) -> np.ndarray:
-        """Interpolate values (V, n) of the vertices: (N, n) float32."""
-        return sum(self.shares[:, k, None] * values[self.corners[:, k]].astype(np.float32) for k in range(3))
-
-
-def bilinear(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Interpolate a picture (H, W, C) at pixel coordinates (N, 2): (N, C) float32. All must be inside it."""
-    rows = max(1, -(-len(pixels) // 4096))  # OpenCV takes no empty arrays
-    maps = np.full((2, rows * 4096), 0.5, np.float32)
-    maps[:, : len(pixels)] = pixels.T - 0.5
-    across, down = maps.reshape(2, rows, 4096)
-    found = cv2.remap(picture, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return found.reshape(rows * 4096, -1)[: len(pixels)]
-
-
-def mean_around(grid: Grid, s: torch.Tensor, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the weighted means (nodes, C) of values (N, C) of points `s` (N, 3) around the corners of a grid.
-
-    The grid has one octave. `weights` (N,).
-    """
-    (shares,) = grid.weights(s)
-    return shares.T @ (values * weights[:, None]) / np.maximum(shares.T @ weights, 1e-12)[:, None]
-
-
-def smoothed(grid: Grid, s: torch.Tensor, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return values (N, C) of points `s` (N, 3) as a grid of one octave represents them. `weights` (N,)."""
-    return grid.weights(s)[0] @ mean_around(grid, s, values, weights)
+    usable = seen.surely(torch.ones(1)).numpy()[0] & ~seen.clipped[0].numpy().any(-1)
+    photograph = np.dstack([seen.rgb[0].numpy(), eroded(eroded(usable))]).astype(np.float32)
+    own, other = (points.at(at, triangles) for at in (pixels, predicted.pixels))
+    shown, diffuse, highlights = (bilinear(picture, at.reshape(-1, 2)).reshape(*at.shape[:2], -1) for picture, at in (
+        (photograph, own), (predicted.diffuse, other), (predicted.highlights, other)))  # fmt: skip
+    ratio = (shown[..., :3] - highlights) / np.maximum(diffuse[..., :3], 1e-9)
+    certain = np.minimum(shown[..., 3], diffuse[..., 3]) > 0.999
+    return np.log(ratio.clip(math.exp(-LARGEST), math.exp(LARGEST))), certain
 
 
 @torch.no_grad()
@@ -194,70 +168,45 @@ def sharpened(
     widest = texture_width(before, fitted, width)
     if not widest or not albedo_of(ring.brdf_net):
         return ring
-    s, faces = ring.domain.sample(ring.subdivisions)
-    vertices, material = ring(s.to(ring.center.device))
-    vertices = vertices.cpu().numpy()
-    highlights = {name: material[name] for name in SPECULAR if name in material}
-    shots = {k: at_width(before.shots[k], refined.shots[k], widest) for k in fitted if before.shots[k].files.filename}
-    eyes = {k: shot.camera.position for k, (_, shot) in shots.items()}
+    predictor = Predictor(surface, ring, refined)
+    vertices, normals, faces = predictor.vertices, predictor.normals, predictor.faces
+    given = [k for k in fitted if before.shots[k].files.filename]
+    shots = {k: at_width(before.shots[k], refined.shots[k], widest) for k in given}
     middle = ring.center.cpu().numpy()
     resolution = float(np.median([  # pixels of a photograph for a length of 1 in scene units
-        shot.camera.focal.mean() / np.linalg.norm(eyes[k] - middle) for k, (_, shot) in shots.items()]))  # fmt: skip
+        shot.camera.focal.mean() / np.linalg.norm(shot.camera.position - middle) for _, shot in shots.values()
+    ]))  # fmt: skip
     corners = torch.from_numpy(faces)
-    areas = [float(area_vectors(torch.as_tensor(points), corners).norm(dim=1).sum()) / 2 for points in (s, vertices)]
-    stretch = math.sqrt(areas[1] / areas[0])
-    wanted = areas[1] * resolution**2 / len(faces)  # points in each triangle
-    most = math.floor(math.log(max(1.0, MOST_POINTS / len(faces)), 4))
-    points = Points.of(faces, min(most, max(0, math.ceil(math.log(wanted, 4)))))
-    places, at = points.at(vertices), torch.from_numpy(points.at(s.numpy()))
-    normals = points.at(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    visibility = Visibility(vertices, faces, [])
-    ratios = Ratios(len(places))
-    for number, (k, (own, shot)) in enumerate(progress(shots.items(), "fine texture", len(shots))):
-        seen = enlarged(before, k, own, shot)
-        logarithms, usable = ratio_picture(surface, ring, highlights, refined, shot, seen)
-        view = MaskedCamera(shot.camera, usable.astype(np.uint8) * 255)
-        visible = np.flatnonzero(visibility.seen_by(view, places, normals))
-        pixels, _ = shot.camera.project(places[visible].astype(float))
-        away = eyes[k] - places[visible]
+    domain, area = (float(area_vectors(torch.as_tensor(at), corners).norm(dim=1).sum()) / 2
+                    for at in (predictor.s, vertices))  # fmt: skip
+    scale = resolution * math.sqrt(area / domain)  # pixels for a length of 1 on the domain
+    wanted = resolution * math.sqrt(area / len(faces))  # divisions of a triangle, for one point in each pixel
+    divisions = max(1, min(math.ceil(wanted), math.isqrt(MOST_POINTS // len(faces))))
+    ratios = Ratios(Points.of(faces, divisions))
+
+    def predicted(k: int) -> Prediction:
+        return predictor.of(at_width(before.shots[k], refined.shots[k], min(widest, PREDICTED))[1])
+
+    def compare(k: int, found: Prediction) -> None:
+        camera = shots[k][1].camera
+        away = camera.position - vertices
         distance = np.linalg.norm(away, axis=1)
-        cosine = ((normals[visible] * away).sum(1) / distance).clip(0, 1)
-        weight = cosine**SLANT / (resolution * distance / shot.camera.focal.mean()) ** 2
-        ratios.add(number % 2, visible, bilinear(logarithms.astype(np.float32), pixels), weight.astype(np.float32))
-    values, weights = agreed(ratios, Grid.around(at, COARSE * widest / width / stretch / resolution, 1, 3), at)
-    if values is None:
+        weights = ((normals * away).sum(1) / distance).clip(0, 1) ** SLANT
+        weights *= (camera.focal.mean() / resolution / distance) ** 2
+        triangles = np.flatnonzero(found.seen[faces].all(1))
+        seen = enlarged(before, k, *shots[k])
+        logarithms, usable = ratios_of(found, seen, ratios.points, triangles, camera.project(vertices)[0])
+        ratios.add(
+            given.index(k) % 2, triangles, logarithms, usable * ratios.points.at(weights[:, None], triangles)[..., 0]
+        )
+
+    for _ in progress(pipelined(predicted, compare, given), "fine texture", len(given)):
+        pass
+    grid = ratios.texture(predictor.s, COARSE * widest / width / scale, CELL * max(1.0, wanted / divisions) / scale)
+    if grid is None:
         return ring
-    shown = weights > 0
-    at, values, weights = at[shown], values[shown], weights[shown]
-    grid = Grid.around(at, CELL / stretch / resolution, 1, 3)
-    (shares,), nodes = grid.weights(at), np.zeros((len(grid.keys(0)), 3), np.float32)
-    for _ in range(SOLVING):  # for values of the corners whose interpolation is `values`
-        nodes += mean_around(grid, at, values - shares @ nodes, weights)
-    grid.values[0].copy_(torch.from_numpy(nodes))
-    grid.latest.clear()  # the weights take more memory than the values
     return FittedObject(
         ring.center, float(ring.radius), domain=ring.domain, bsdf=ring.bsdf, indirect=ring.indirect, up=ring.up,
         subdivisions=ring.subdivisions, ground=ring.ground, metres=ring.metres,
         networks=(ring.shape_net, SharpenedMaterial.of(ring.brdf_net, grid)),
     ).to(ring.center.device)  # fmt: skip
-
-
-def agreed(ratios: Ratios, coarse: Grid, s: torch.Tensor) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return what both halves of the photographs say of fine colours: (logarithms (N, 3), weights (N,)).
-
-    Coarse differences are subtracted. What remains is multiplied by the share of its variance, around each corner of
-    the grid `coarse`, that the halves have in common: so noise is left out (Wiener's filter). `s` (N, 3): the points.
-    The logarithms are None if the halves have hardly anything in common.
-    """
-    means, weights = ratios.means(), ratios.weights
-    total = weights.sum(0)
-    both = np.where((weights > 0).all(0), total, 0)
-    for half in range(2):
-        means[half] -= smoothed(coarse, s, means[half], weights[half])
-    mean = (means * weights[..., None]).sum(0) / np.maximum(total, 1e-9)[:, None]
-    common = smoothed(coarse, s, means.prod(0).mean(1, keepdims=True), both).clip(min=0)
-    different = smoothed(coarse, s, np.square(means[0] - means[1]).mean(1, keepdims=True) / 4, both)
-    if not both.any() or (both * common[:, 0]).sum() < CERTAIN * (both * (common + different)[:, 0]).sum():
-        return None, total
-    return mean * (common / np.maximum(common + different, 1e-12)), total

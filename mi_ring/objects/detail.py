@@ -87,9 +87,11 @@ class Grid(nn.Module):
         self.latest.clear()
         rows, found = np.arange(0, 8 * len(s) + 1, 8, dtype=np.int32), []
         for k in range(len(self.values)):
-            parts = [self.octave_weights(part, k) for part in s.detach().cpu().split(AT_ONCE)]
-            weight, node = (torch.cat(part).numpy().ravel() for part in zip(*parts))
-            found.append(scipy.sparse.csr_matrix((weight, node, rows), (len(s), len(self.keys(k)))))
+            weight, node = np.empty((len(s), 8), np.float32), np.empty((len(s), 8), np.int32)
+            for first in range(0, len(s), AT_ONCE):
+                part = slice(first, first + AT_ONCE)
+                weight[part], node[part] = self.octave_weights(s[part].detach().cpu(), k)
+            found.append(scipy.sparse.csr_matrix((weight.ravel(), node.ravel(), rows), (len(s), len(self.keys(k)))))
         self.latest.append((s.detach(), stamp(s), found))
         release_memory()  # of intermediate results, which take more than the weights
         return found

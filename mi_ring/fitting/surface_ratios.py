@@ -1,0 +1,116 @@
+"""Ratios of photographs and predictions, at points of the surface."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from mi_ring.objects.detail import Grid
+
+SOLVING = 4  #: steps to find the values of the corners of a grid
+CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have in common
+
+
+class Points(NamedTuple):
+    """Points in the triangles of a mesh, at the centres of equal parts."""
+
+    faces: np.ndarray  #: (F, 3)
+    shares: np.ndarray  #: (n, 3) barycentric coordinates of the points of each triangle
+
+    @classmethod
+    def of(cls, faces: np.ndarray, divisions: int) -> "Points":
+        """Make `divisions`² points in each triangle of `faces` (F, 3)."""
+        steps = np.indices((divisions, divisions)).reshape(2, -1).T
+        above = np.concatenate([steps[steps.sum(1) < divisions - k] + (k + 1) / 3 for k in range(2)]) / divisions
+        return cls(faces, np.column_stack([1 - above.sum(1), above]).astype(np.float32))
+
+    def at(self, values: np.ndarray, triangles: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Interpolate values (V, C) of the vertices in some triangles: (triangles, n, C) float32."""
+        corners = values.astype(np.float32)[self.faces[triangles]]
+        return sum(self.shares[:, k, None] * corners[:, None, k] for k in range(3))
+
+
+def bilinear(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Interpolate a picture (H, W, C) at pixel coordinates (N, 2): (N, C) float32. All must be inside it."""
+    rows = max(1, -(-len(pixels) // 4096))  # OpenCV takes no empty arrays
+    maps = np.full((2, rows * 4096), 0.5, np.float32)
+    maps[:, : len(pixels)] = pixels.T - 0.5
+    across, down = maps.reshape(2, rows, 4096)
+    found = cv2.remap(picture, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return found.reshape(rows * 4096, -1)[: len(pixels)]
+
+
+class LowPass:
+    """Means of values on a surface, around the corners of cubes.
+
+    `points`: where the values are. `s` (V, 3): vertices on the domain. `cell`: side of the cubes, on the domain.
+    """
+
+    def __init__(self, points: Points, s: torch.Tensor, cell: float) -> None:
+        centres = s[torch.from_numpy(points.faces)].mean(1)
+        grid = Grid.around(torch.cat([s, centres]), cell, 1, 1)
+        self.gather, self.spread = (grid.weights(at)[0] for at in (centres, s))
+
+    def of(self, sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return means (V, C) at the vertices. `sums` (F, C), `weights` (F,): of weighted values of the triangles."""
+        both = self.spread @ (self.gather.T @ np.column_stack([sums, weights]))
+        return both[:, :-1] / np.maximum(both[:, -1:], 1e-12)
+
+
+class Ratios:
+    """Logarithms of ratios at n points of each triangle of a surface, from each half of the photographs."""
+
+    def __init__(self, points: Points) -> None:
+        self.points = points
+        self.sums = np.zeros((2, len(points.faces), len(points.shares), 3), np.float32)
+        self.weights = np.zeros(self.sums.shape[:3], np.float32)
+
+    def add(self, half: int, triangles: np.ndarray, logarithms: np.ndarray, weights: np.ndarray) -> None:
+        """Add what a photograph shows. `triangles` (f,): indices. `logarithms` (f, n, 3). `weights` (f, n)."""
+        self.sums[half, triangles] += logarithms * weights[..., None]
+        self.weights[half, triangles] += weights
+
+    @torch.no_grad()
+    def texture(self, s: torch.Tensor, coarse: float, fine: float) -> Grid | None:
+        """Return what both halves show as a grid with the channels red, green and blue; None if this is nothing.
+
+        `s` (V, 3): vertices of the triangles, on the domain. `coarse`: what is larger is left out. `fine`: side of the
+        cubes of the grid. Call it once: it needs the memory of the sums.
+        """
+        values = self.agreed(LowPass(self.points, s, coarse))
+        if values is None:
+            return None
+        shown = self.weights.any(0)
+        at = torch.from_numpy(self.points.at(s.numpy())[shown])
+        values, weights = values[shown], self.weights.sum(0)[shown]
+        grid = Grid.around(at, fine, 1, 3)
+        (shares,), nodes = grid.weights(at), np.zeros((len(grid.keys(0)), 3), np.float32)
+        total = np.maximum(shares.T @ weights, 1e-12)[:, None]
+        for _ in range(SOLVING):  # for values of the corners whose interpolation is `values`
+            nodes += shares.T @ ((values - shares @ nodes) * weights[:, None]) / total
+        grid.values[0].copy_(torch.from_numpy(nodes))
+        grid.latest.clear()  # the weights take more memory than the values
+        return grid
+
+    def agreed(self, low_pass: LowPass) -> np.ndarray | None:
+        """Return what both halves show of fine ratios: (F, n, 3) logarithms. Replaces the sums by fine means.
+
+        Coarse differences are subtracted. What remains is multiplied by the share of its variance nearby that the
+        halves have in common: so noise is left out (Wiener's filter). Returns None if they have hardly anything in
+        common.
+        """
+        means, total = self.sums, self.weights.sum(0)
+        for own, weights in zip(means, self.weights):
+            own /= np.maximum(weights, 1e-9)[..., None]
+            # Of the ratios themselves: the fitted colour of a print is the mean of ink and paper, not of logarithms.
+            coarse = low_pass.of((np.exp(own) * weights[..., None]).sum(1), weights.sum(1))
+            own -= self.points.at(np.log(np.maximum(coarse, 1e-3)))
+        both = np.where((self.weights > 0).all(0), total, 0)
+        common = (both * means.prod(0).mean(-1)).sum(1)
+        different = (both * np.square(means[0] - means[1]).mean(-1) / 4).sum(1)
+        if not both.any() or common.sum() < CERTAIN * (common + different).sum():
+            return None
+        variances = low_pass.of(np.column_stack([common, different]), both.sum(1)).clip(min=0)
+        share = self.points.at(variances[:, :1] / np.maximum(variances.sum(1, keepdims=True), 1e-12))
+        return share * (means * self.weights[..., None]).sum(0) / np.maximum(total, 1e-9)[..., None]
