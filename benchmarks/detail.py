@@ -23,9 +23,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.objects.sharpened_material import SharpenedMaterial
-from mi_ring.output.atlas import reflectances
 from mi_ring.rendering import prediction
-from mi_ring.rendering.bridge import to_drjit
 from mi_ring.rendering.image_formation import render_maps
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
@@ -35,7 +33,6 @@ from mi_ring.scene.shot import Shot
 import cv2
 import mitsuba as mi
 import numpy as np
-import torch
 from accuracy import table
 from scipy.ndimage import gaussian_filter, map_coordinates
 from tqdm import tqdm
@@ -73,14 +70,13 @@ class Maps:
     """
 
     def __init__(self, path: Path, capture: Capture, textured: bool = False) -> None:
-        self.surface, self.ring, self.textured = None, None, textured
+        self.surface, self.ring = None, None
         if path.is_dir():
             self.ring = load_fit(path)
             self.surface = Surface(capture.scene, capture.shape, self.ring)
-            self.s, faces = self.ring.domain.sample(self.ring.subdivisions)
-            self.surface.show(self.ring, self.s, faces)
-            with torch.no_grad():
-                self.material = self.ring.material(self.s)
+            self.surface.show(self.ring, *self.ring.domain.sample(self.ring.subdivisions))
+            if not textured:
+                self.surface.texture = None
         else:
             self.scene = mi.load_dict({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
 
@@ -90,40 +86,12 @@ class Maps:
         if self.surface is not None:
             found = prediction.maps(self.surface, view)
             normal, diffuse = found["normal"][0], found["diffuse"][0]
-            if self.textured:
-                diffuse = self.texture(view)
         else:
             channels = np.stack([np.array(c) for c in render_maps(self.scene, view, {"vertex_diffuse": 3})], -1)
             normal, diffuse = np.split(channels.reshape(*view.shape[1:], 6), 2, -1)
         seen = averaged((np.abs(normal).sum(-1, keepdims=True) > 0).astype(np.float32))[..., 0] > 0.999
         normal = averaged(normal)
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9), averaged(diffuse), seen
-
-    def texture(self, view: Photographs) -> np.ndarray:
-        """The diffuse colour (H, W, 3) of the texture: domain points are rendered in the place of colours."""
-        self.surface.write_arrays({"vertex_diffuse": to_drjit(self.s)})
-        s = prediction.maps(self.surface, view)["diffuse"][0]
-        self.surface.write_arrays({"vertex_diffuse": to_drjit(self.material["diffuse"])})
-        colours, inside = np.zeros_like(s), np.abs(s).sum(-1) > 0
-        colours[inside] = reflectances(self.ring, s[inside])["diffuse"]
-        return colours
-
-    def photograph(self, capture: Capture, k: int) -> np.ndarray:
-        """The predicted linear radiance (H, W, 3) of a photograph."""
-
-        def drawn() -> np.ndarray:
-            return prediction.draw(self.surface, capture.photograph(k), shadows=capture.shadows,
-                                   indirect=self.ring.indirect)[0][0].numpy()  # fmt: skip
-
-        full = drawn()
-        if not self.textured:
-            return full
-        self.surface.write_arrays({"vertex_specular": to_drjit(0 * self.material["specular"])})
-        diffuse = drawn()
-        self.surface.write_arrays({"vertex_specular": to_drjit(self.material["specular"])})
-        view = finer(capture.shots[k].camera)
-        fine, coarse = averaged(self.texture(view)), averaged(prediction.maps(self.surface, view)["diffuse"][0])
-        return full + diffuse * (fine / np.maximum(coarse, 1e-9) - 1)
 
 
 def smoothed(picture: np.ndarray, inside: np.ndarray, wavelength: float) -> np.ndarray:
@@ -225,9 +193,10 @@ def novel_errors(maps: Maps, novel: Capture) -> dict[str, float]:
     """PSNR [dB] of predicted novel views inside the object, of all and of what is finer than `FINE` pixels."""
     squares = []
     for k in range(len(novel)):
+        rgb, _ = prediction.draw(maps.surface, novel.photograph(k), shadows=novel.shadows, indirect=maps.ring.indirect)
         seen = novel.observe([k])
         a, b = (linear_to_srgb(np.clip(recorded(picture, novel.shots[k]), 0, 1))
-                for picture in (maps.photograph(novel, k), seen.rgb[0].numpy()))  # fmt: skip
+                for picture in (rgb[0].numpy(), seen.rgb[0].numpy()))  # fmt: skip
         inside = seen.mask[0].numpy() > 0.99
         fine = (a - b) - smoothed(a - b, inside, FINE)
         squares.append([np.square(d[inside]).mean() for d in (a - b, fine)])

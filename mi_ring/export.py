@@ -13,7 +13,7 @@ from mi_ring.errors import InputError
 from mi_ring.objects.material_edits import MaterialOptions, edit_material
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output.ambiguity import ambiguity_of
-from mi_ring.output.exporting import RESOLUTION, export, require_exportable
+from mi_ring.output.exporting import export, require_exportable
 from mi_ring.output.mitsuba_scene import first_photograph
 from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system import command
@@ -41,9 +41,9 @@ class ExportConfig(MaterialOptions):
     """Level of the mesh, which has about 10 · 4^level vertices. The highest level is 10 for .ply, 8 for other files.
     A lower level gives a smaller file, a higher level a finer mesh.
     Without this option: the level of the fit, but at most 5 for .glb, whose normal map has the finer detail."""
-    resolution: int = RESOLUTION
+    resolution: int | None = None
     """Width and height of the textures [texels], 64 to 4096. More texels keep finer detail and make larger files.
-    A .ply has no textures."""
+    A .ply has no textures. Without this option: 2048, or 4096 if the fit has found texture that needs it."""
     time: float = 1.0
     """Which state of the deformation to write, 0 to 1. 0: the start surface of the fit. 1: the finished object.
     0.5: the surface after half of the deformation."""

@@ -17,11 +17,14 @@ from mi_ring.fitting.surface_ratios import LowPass, Points, Ratios, bilinear
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.nets.brdf_net import BRDFNet, Parameter
+from mi_ring.objects.detail import Grid
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.material_edits import EditedMaterial
 from mi_ring.objects.ring_file import compact, ring_of, ring_state
 from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.output.atlas import reflectances
+from mi_ring.output.exporting import resolution_of
+from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Files, Response, Shot
@@ -134,6 +137,50 @@ def test_print_that_the_fit_has_not_seen_is_found(sharp):
 def test_meshes_keep_the_colours_that_they_can_show(sharp):
     s = torch.from_numpy(on_the_ball())
     np.testing.assert_allclose(sharp.material(s)["diffuse"].detach(), plain(s) / np.pi, rtol=1e-5)
+
+
+def test_pictures_and_maps_show_it(sharp, print_scene):
+    capture = load_capture(print_scene)
+    surface = Surface(capture.scene, capture.shape, sharp)
+    surface.show(sharp, *sharp.domain.sample(5))
+    pictures = [prediction.draw(surface, capture.photograph(0))[0][0].numpy() for _ in range(2)]
+    diffuse = prediction.maps(surface, capture.photograph(0))["diffuse"][0]
+    surface.texture = None
+    plain = prediction.draw(surface, capture.photograph(0))[0][0].numpy()
+    seen = capture.observe([0]).rgb[0].numpy()
+    inside = plain.min(-1) > 0.1 * np.quantile(plain, 0.9)
+    textured, smooth = (
+        np.square(np.log(picture[inside] / seen[inside])).mean() ** 0.5 for picture in (pictures[0], plain)
+    )
+    assert textured < 0.06 < 0.2 < smooth
+    np.testing.assert_array_equal(pictures[1], pictures[0])
+    np.testing.assert_allclose((diffuse / MATTE)[inside], pictures[0][inside] / plain[inside], rtol=0.1)
+
+
+def test_it_does_not_change_highlights(sharp, print_scene):
+    """Where nothing is matte, there is nothing to see of a texture."""
+    capture, ring = load_capture(print_scene), ring_of(ring_state(sharp))
+    surface = Surface(capture.scene, capture.shape, ring)
+    with torch.no_grad():
+        last = [p for p in ring.brdf_net.parameters() if p.shape == (5,)][-1]
+        last.copy_(torch.tensor([-30.0, -30.0, -30.0, 0.0, 0.0]))
+    surface.show(ring, *ring.domain.sample(5))
+    pictures = [prediction.draw(surface, capture.photograph(0))[0][0].numpy() for _ in range(2)]
+    surface.texture = None
+    plain = prediction.draw(surface, capture.photograph(0))[0][0].numpy()
+    assert plain.max() > 0.1
+    for picture in pictures:  # the second shows that the first has brought the highlights back
+        np.testing.assert_allclose(picture, plain, atol=1e-6)
+
+
+def test_exported_textures_are_as_fine_as_it(sharp):
+    """The ball has an area of 4 π: of 2048² texels, three fifths of which show it, each is 0.0022 wide."""
+    assert resolution_of(pale_ball()) == 2048
+    for cell, resolution in ((0.0024, 2048), (0.0021, 4096)):
+        grid = Grid.around(torch.zeros(1, 3), cell, 1, 3)
+        ring = pale_ball()
+        ring.brdf_net = EditedMaterial(SharpenedMaterial.of(ring.brdf_net, grid), {}, {})
+        assert resolution_of(ring) == resolution
 
 
 def test_a_ball_of_one_colour_keeps_it(tmp_path):

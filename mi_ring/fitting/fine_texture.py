@@ -22,9 +22,9 @@ from mi_ring.capture.observation import Observation, observed
 from mi_ring.capture.reduction import reduced_image, windowed
 from mi_ring.fitting.surface_ratios import Points, Ratios, bilinear
 from mi_ring.geometry.meshes import area_vectors
+from mi_ring.nets.brdf_net import SPECULAR, albedo_of
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.material_edits import SPECULAR
-from mi_ring.objects.sharpened_material import SharpenedMaterial, albedo_of
+from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.rendering import prediction
 from mi_ring.rendering.bridge import to_drjit
 from mi_ring.rendering.photographs import Photographs
@@ -166,7 +166,7 @@ def sharpened(
     photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
     widest = texture_width(before, fitted, width)
-    if not widest or not albedo_of(ring.brdf_net):
+    if not widest or not albedo_of(ring.brdf_net.bsdf_parameters):
         return ring
     predictor = Predictor(surface, ring, refined)
     vertices, normals, faces = predictor.vertices, predictor.normals, predictor.faces

@@ -23,12 +23,20 @@ class Parameter(NamedTuple):
     start: float = 0.0  #: added to the network's output before that is mapped to the range
 
 
+ALBEDO = "diffuse", "reflectance", "diffuse_reflectance", "base_color"  #: Mitsuba's names of the colour without gloss
+SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha")  #: and of the gloss
+
 #: The paper's five numbers.
 COOK_TORRANCE = (
     Parameter("diffuse", 3, 0.0, math.inf),
     Parameter("specular", 1, 0.0, math.inf, -2.0),
     Parameter("roughness", 1, 0.0, 1.0, -0.5),
 )
+
+
+def albedo_of(parameters: Sequence[Parameter]) -> Parameter | None:
+    """Return the parameter that is the albedo, the colour without gloss. Returns None if there is none."""
+    return next((p for p in parameters if p.name in ALBEDO and p.channels == 3), None)
 
 
 class MaterialNet(nn.Module):
@@ -79,12 +87,19 @@ class MaterialNet(nn.Module):
                 result[parameter.name] = parameter.low + (parameter.high - parameter.low) * torch.sigmoid(x)
         return result
 
-    def fine(self, s: Tensor) -> dict[str, Tensor]:
-        """Compute the parameters at domain points (..., 3) that are texels, closer to each other than any vertices.
+    def texture(self, s: Tensor) -> Tensor | None:
+        """Compute factors (..., 3) of the albedo at domain points (..., 3), if there is a texture.
 
-        The result is that of a call, unless the material has a texture that is too fine for vertices.
+        A texture is too fine for the vertices of a mesh. So a call leaves it out.
         """
-        return self(s)
+        return None
+
+    def fine(self, s: Tensor) -> dict[str, Tensor]:
+        """Compute the parameters, with the texture, at domain points (..., 3)."""
+        values, factors, colour = self(s), self.texture(s), albedo_of(self.bsdf_parameters)
+        if factors is None or not colour:
+            return values
+        return values | {colour.name: (values[colour.name] * factors).clamp(colour.low, colour.high)}
 
 
 @register_network("brdfnet")

@@ -11,11 +11,9 @@ from torch import Tensor
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.sphere_map import SphericalMap
-from mi_ring.nets.brdf_net import MaterialNet
+from mi_ring.nets.brdf_net import ROUGHNESS, SPECULAR, MaterialNet
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
-
-SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha")  #: Mitsuba's names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +91,8 @@ class TransferredMaterial(MaterialNet):
     def forward(self, s: Tensor) -> dict[str, Tensor]:
         return self.net(self.corresponding(s))
 
-    def fine(self, s: Tensor) -> dict[str, Tensor]:
-        return self.net.fine(self.corresponding(s))
+    def texture(self, s: Tensor) -> Tensor | None:
+        return self.net.texture(self.corresponding(s))
 
     def corresponding(self, s: Tensor) -> Tensor:
         """Return the points (..., 3) of the other domain that correspond to points (..., 3) of this one."""
@@ -115,8 +113,8 @@ class EditedMaterial(MaterialNet):
     def forward(self, s: Tensor) -> dict[str, Tensor]:
         return self.edited(self.net(s))
 
-    def fine(self, s: Tensor) -> dict[str, Tensor]:
-        return self.edited(self.net.fine(s))
+    def texture(self, s: Tensor) -> Tensor | None:
+        return self.net.texture(s)
 
     def edited(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
         """Apply gains and offsets to parameters, in place. Returns them."""

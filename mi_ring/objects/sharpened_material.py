@@ -5,24 +5,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mi_ring.nets.brdf_net import MaterialNet, Parameter
+from mi_ring.nets.brdf_net import MaterialNet
 from mi_ring.nets.registry import architecture_of, build, register_network
 from mi_ring.objects.detail import Grid
-
-ALBEDO = "diffuse", "reflectance", "diffuse_reflectance", "base_color"  #: Mitsuba's names of the colour without gloss
-
-
-def albedo_of(net: MaterialNet) -> Parameter | None:
-    """Return the parameter of a material that is its colour without gloss. Returns None if it has none."""
-    return next((p for p in net.bsdf_parameters if p.name in ALBEDO and p.channels == 3), None)
 
 
 @register_network("sharpened-material")
 class SharpenedMaterial(MaterialNet):
-    """The material of another network, whose colour is multiplied by exp(grid) at the texels of a texture.
-
-    Vertices of a mesh get the material of the other network: they are too far apart to show the grid.
-    """
+    """The material of another network, whose albedo is multiplied by a texture: exp(grid)."""
 
     def __init__(self, net: dict, grid: dict) -> None:
         """Make a material whose grid is 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`."""
@@ -33,10 +23,7 @@ class SharpenedMaterial(MaterialNet):
 
     @classmethod
     def of(cls, net: MaterialNet, grid: Grid) -> "SharpenedMaterial":
-        """Multiply the colour of `net` by exp(`grid`), whose three channels are red, green and blue.
-
-        `net` must have a colour: see `albedo_of`.
-        """
+        """Multiply the albedo of `net` by exp(`grid`), whose three channels are red, green and blue."""
         sharpened = cls(architecture_of(net), grid.arguments())
         sharpened.base, sharpened.grid = net, grid
         sharpened.set_parameters(net.bsdf_parameters, float(net.scale))
@@ -52,8 +39,5 @@ class SharpenedMaterial(MaterialNet):
     def forward(self, s: Tensor) -> dict[str, Tensor]:
         return self.base(s)
 
-    def fine(self, s: Tensor) -> dict[str, Tensor]:
-        values, colour = self.base.fine(s), albedo_of(self)
-        assert colour
-        finer = values[colour.name] * torch.exp(self.grid(s.reshape(-1, 3)).reshape(s.shape))
-        return values | {colour.name: finer.clamp(colour.low, colour.high)}
+    def texture(self, s: Tensor) -> Tensor:
+        return torch.exp(self.grid(s.reshape(-1, 3)).reshape(s.shape))

@@ -5,9 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 from mi_ring.errors import InputError
 from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.output import gltf
 from mi_ring.output.atlas import rasterise, reflectances, unwrap
 from mi_ring.output.mitsuba_scene import write_scene
@@ -20,22 +22,24 @@ from mi_ring.system.files import require_place, write_file
 KINDS = ".ply", ".obj", ".glb", ".xml"
 GLB_LEVEL = 5  #: of its mesh; finer detail is in the normal map
 MAX_LEVEL, MAX_PLY_LEVEL = 8, 10  #: finest level of a mesh with textures, and of one without
-RESOLUTION = 2048  #: width of textures [px]
+RESOLUTIONS = 2048, 4096  #: usual width of textures [px]; that of a material with a texture which needs it
+AREA_LEVEL = 4  #: of the mesh that tells the area of a domain
+FILLED = 0.6  #: share of the texels that show a part of the surface
 
 
 def export(
-    ring: FittedObject, file: str | Path, subdivisions: int | None = None, resolution: int = RESOLUTION,
+    ring: FittedObject, file: str | Path, subdivisions: int | None = None, resolution: int | None = None,
     time: float = 1.0, metres: float | None = None, views: Sequence[MaskedCamera] | None = None,
     photograph: tuple[Shot, np.ndarray | None] | None = None,
 ) -> list[Path]:  # fmt: skip
     """Write a fitted object as PLY, OBJ, GLB or Mitsuba XML, by the suffix of `file`. Returns all files written.
 
     `subdivisions`: level of the mesh, about 10 · 4^level vertices; None: the level of the fit, at most 5 for GLB.
-    `resolution`: width of the textures [px]. `time`: state of the deformation, from 0 (start surface) to 1 (fitted
-    object). `metres`: length of a scene unit [m], only for GLB; None: the length that `ring` knows, if any. `views`:
-    cameras and masks of the photographs; PLY and GLB then mark the vertices that a photograph shows. `photograph`: for
-    XML, a pair of the photograph whose camera and light are written and the room light, spherical harmonics (BASIS, 3)
-    or None.
+    `resolution`: width of the textures [px]; None: see `resolution_of`. `time`: state of the deformation, from 0 (start
+    surface) to 1 (fitted object). `metres`: length of a scene unit [m], only for GLB; None: the length that `ring`
+    knows, if any. `views`: cameras and masks of the photographs; PLY and GLB then mark the vertices that a photograph
+    shows. `photograph`: for XML, a pair of the photograph whose camera and light are written and the room light,
+    spherical harmonics (BASIS, 3) or None.
 
     Raises InputError for values out of range, for a BSDF that glTF cannot express, and if a file cannot be written.
     """
@@ -48,7 +52,7 @@ def export(
     if kind in (".glb", ".obj"):
         gltf.require_expressible(ring)
     require_place(file)
-    level = subdivisions
+    level, resolution = subdivisions, resolution or resolution_of(ring)
     if level is None:
         level = min(GLB_LEVEL, ring.subdivisions) if kind == ".glb" else ring.subdivisions
     if kind == ".ply":
@@ -65,13 +69,22 @@ def export(
     return write_obj(file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
 
 
+def resolution_of(ring: FittedObject) -> int:
+    """Choose the width of the textures of an object [px]: 2048, or 4096 if its own texture is finer than that."""
+    area = trimesh.Trimesh(*ring.domain.sample(AREA_LEVEL), process=False).area
+    textures = [part.grid for part in ring.brdf_net.modules() if isinstance(part, SharpenedMaterial)]
+    finer = any(area / grid.cells[-1] ** 2 > FILLED * RESOLUTIONS[0] ** 2 for grid in textures)
+    return RESOLUTIONS[finer]
+
+
 def require_exportable(
-    file: Path, subdivisions: int | None, resolution: int, time: float, metres: float | None
+    file: Path, subdivisions: int | None, resolution: int | None, time: float, metres: float | None
 ) -> str:  # fmt: skip
     """Check arguments for the export to `file`. Returns its suffix in lower case: .ply, .obj, .glb or .xml.
 
-    `subdivisions`: level of the mesh; None: any. `resolution`: width of the textures [px]. `time`: state of the
-    deformation, 0 to 1. `metres`: length of a scene unit [m]; None: not given. Raises InputError if one is invalid.
+    `subdivisions`: level of the mesh; None: any. `resolution`: width of the textures [px]; None: not given. `time`:
+    state of the deformation, 0 to 1. `metres`: length of a scene unit [m]; None: not given. Raises InputError if one is
+    invalid.
     """
     kind = file.suffix.lower()
     if kind not in KINDS:
@@ -80,7 +93,7 @@ def require_exportable(
     if subdivisions is not None and not (isinstance(subdivisions, int | np.integer) and 0 <= subdivisions <= finest):
         more = f"; textures have the finer detail; .ply takes up to {MAX_PLY_LEVEL}" * (finest == MAX_LEVEL)
         raise InputError(f"--subdivisions: is {subdivisions}, must be 0 to {finest}{more}")
-    if not 64 <= resolution <= 4096:
+    if resolution is not None and not 64 <= resolution <= 4096:
         raise InputError(f"--resolution: is {resolution}, must be 64 to 4096")
     if not 0 <= time <= 1:
         raise InputError(f"--time: is {time}, must be 0 to 1")

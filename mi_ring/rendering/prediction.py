@@ -1,6 +1,7 @@
 """Renders photographs of a surface as tensors: with gradients for a fit, without gradients for pictures and maps."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import mitsuba as mi
 import numpy as np
@@ -8,16 +9,17 @@ import torch
 from torch import Tensor
 
 from mi_ring.geometry.meshes import area_vectors
-from mi_ring.nets.brdf_net import COOK_TORRANCE, Parameter
+from mi_ring.nets.brdf_net import COOK_TORRANCE, SPECULAR, Parameter, albedo_of
 from mi_ring.rendering.bridge import differentiable, evaluated, to_drjit
 from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_maps, render_photographs
-from mi_ring.rendering.photographs import Photographs
+from mi_ring.rendering.photographs import Photographs, pixel_rays
 from mi_ring.rendering.surface import Surface
 from mi_ring.rendering.views import Views
 from mi_ring.scene.plain_mesh import POSITIONS
 
+TEXELS = 4  #: rays for the texture in a pixel
 NO_AREA = 1e-6  #: twice a triangle's area / (longest side)² below which float32 gives no normal
 
 
@@ -95,7 +97,8 @@ def draw(
     Returns CPU tensors: (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). `photographs`: which photographs
     to render, and at what size. `spp`: samples per pixel. `shadows`: the photographs' own lights cast shadows.
     `indirect`: add interreflection, rendered with `paths` paths per pixel in a picture that is at most 128 pixels wide.
-    The light of the room in `photographs` is always added. `occlusion`: True: the surface blocks a part of the room
+    The light of the room in `photographs` is always added. So is the texture of a surface that `show` has written.
+    `occlusion`: True: the surface blocks a part of the room
     light; False: it blocks none of it, which is faster.
 
     However many pixels and samples there are, this needs about a gigabyte of memory besides the pictures. `indirect` or
@@ -113,13 +116,53 @@ def draw(
             rgb = rgb + added.interreflection
         if harmonics and occlusion:
             rgb = (rgb + added.occlusion(torch.from_numpy(photographs.room).to(rgb))).clamp(min=0)
+    if surface.texture:
+        with without_gloss(surface):
+            matte, _ = draw(surface, photographs, spp, seed, shadows, indirect, paths, occlusion)
+        rgb = rgb.cpu() + matte * (texture_factors(surface, photographs, seed) - 1)
     return rgb.cpu(), coverage.cpu()
+
+
+@contextmanager
+def without_gloss(surface: Surface) -> Iterator[None]:
+    """Show the surface without highlights and without its texture."""
+    names = [f"vertex_{name}" for name in SPECULAR if surface.prefix + f"vertex_{name}" in surface.params]
+    gloss = {name: mi.Float(surface.params[surface.prefix + name]) for name in names}  # not references
+    texture = surface.texture
+    surface.texture = None
+    surface.write_arrays({name: 0 * value for name, value in gloss.items()})
+    try:
+        yield
+    finally:
+        surface.texture = texture
+        surface.write_arrays(gloss)
+
+
+@torch.no_grad()
+def texture_factors(surface: Surface, photographs: Photographs, seed: int = 0) -> Tensor:
+    """Compute the factors (N, H, W, 3) by which the texture changes the matte light of pixels."""
+    own, parts = photographs.in_units(surface.unit), []
+    for pixels in photographs.chunks(TEXELS):
+        hit = surface.scene.ray_intersect_preliminary(pixel_rays(own, TEXELS, seed, pixels)[0])
+        shown = np.array(hit.is_valid() & (hit.shape == mi.ShapePtr(surface.shape)))
+        u, v = np.array(hit.prim_uv)[:, shown]
+        corners = surface.faces[np.array(hit.prim_index)[shown]]
+        s = sum(
+            share[:, None] * surface.s.numpy(force=True)[corners[:, k]] for k, share in enumerate((1 - u - v, u, v))
+        )
+        factors = torch.ones(len(shown), 3)
+        if len(s):
+            factors[torch.from_numpy(shown)] = surface.texture(torch.from_numpy(s)).cpu()
+        parts.append(factors.reshape(-1, TEXELS, 3).mean(1))
+    return torch.cat(parts).reshape(*photographs.shape, 3)
 
 
 def maps(
     surface: Surface, photographs: Photographs, parameters: Sequence[Parameter] = COOK_TORRANCE
 ) -> dict[str, np.ndarray]:
     """Render normals and BSDF parameters at pixel centres of N photographs, for the surface as it was last written.
+
+    The texture of a surface that `show` has written is in its colours.
 
     Returns NumPy arrays by name: `normal` (N, H, W, 3) in world space, and each of `parameters`, (N, H, W, 3) or (N, H,
     W). Pixels without a surface are 0.
@@ -133,4 +176,6 @@ def maps(
     for p in parameters:
         result[p.name] = channels[..., first : first + 3] if p.channels == 3 else channels[..., first]
         first += p.channels
+    if surface.texture and (colour := albedo_of(parameters)):
+        result[colour.name] = result[colour.name] * texture_factors(surface, photographs).numpy()
     return result

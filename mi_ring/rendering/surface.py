@@ -1,6 +1,7 @@
 """The surface that is rendered: the `shapenet` shape of a scene, to whose mesh torch tensors are written."""
 
 import math
+from collections.abc import Callable
 
 import mitsuba as mi
 import numpy as np
@@ -48,6 +49,8 @@ class Surface:
         self.faces_changed = False
         self.edges: Edges | None = None  #: those of the last picture with gradients of moving edges
         self.written = 0  #: number of times that vertices were written
+        self.s = torch.zeros(0, 3)  #: (V, 3) points of the domain that `show` has written
+        self.texture: Callable[[Tensor], Tensor] | None = None  #: of the object that `show` has written
 
     def set_faces(self, faces: np.ndarray) -> None:
         """Set other triangles (F, 3). Vertices and attributes must be written again before the next rendering."""
@@ -114,6 +117,10 @@ class Surface:
         with torch.no_grad():
             self.set_faces(faces)
             self.write(*ring(s.to(ring.center.device), time))
+            self.s = s
+            self.texture = (
+                None if ring.brdf_net.texture(s[:1].to(ring.center.device)) is None else ring.brdf_net.texture
+            )
 
 
 def unit_for(radius: float) -> float:

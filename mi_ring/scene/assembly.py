@@ -25,7 +25,7 @@ class RenderedObject(Protocol):
     center: Any  #: (3,) tensor of the normalising sphere [scene units]
     radius: Any  #: its radius, a tensor
     bsdf: str  #: the BSDF as Mitsuba's XML
-    brdf_net: Any  #: its `bsdf_parameters` have the attributes that the BSDF reads
+    brdf_net: Any  #: a `MaterialNet`; its `bsdf_parameters` have the attributes that the BSDF reads
 
     def surface(self, s: Any, time: float = 1.0) -> Any:
         """Compute the surface points (V, 3) [scene units] for points `s` (V, 3) of the domain, the start surface.
