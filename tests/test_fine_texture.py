@@ -213,6 +213,14 @@ def test_nothing_changes_without_larger_photographs(print_scene, width, fitted):
     assert twice == 2 * once > 0
 
 
+def test_of_many_photographs_some_are_used(print_scene, monkeypatch):
+    capture = load_capture(print_scene, width=40)
+    monkeypatch.setattr(fine_texture, "MOST_PHOTOGRAPHS", 4)
+    assert fine_texture.used(capture, range(12)) == [0, 3, 6, 9]
+    assert fine_texture.used(capture, [1, 5, 6]) == [1, 5, 6]
+    assert fine_texture.texture_seconds(capture, range(12), 40) == fine_texture.texture_seconds(capture, range(4), 40)
+
+
 @pytest.mark.parametrize("name", ["masks", "valid"])
 def test_only_valid_pixels_of_the_object_count(print_scene, name):
     capture, ring = load_capture(print_scene, width=40), pale_ball()

@@ -39,11 +39,18 @@ PREDICTED = 1024  #: largest width of a prediction, which shows nothing finer th
 WORTH = 1.3  #: the photographs must be wider than those of the fit by this factor
 CELL = 1.2  #: side of the cubes of the texture [px]
 COARSE = 8.0  #: differences that are coarser than this are left out [px of the fit]
-MOST_POINTS = 8_000_000
+MOST_POINTS, MOST_PHOTOGRAPHS = 8_000_000, 80
 DARK, GLOSSY = 0.03, 0.5  #: least prediction [median of the object], and largest share of highlights in it
 LARGEST = 1.5  #: largest change of a colour, as a logarithm
 SQUARE = np.ones((3, 3), np.uint8)  #: a pixel and its neighbours
 SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
+
+
+def used(given: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
+    """Choose the photographs for the texture: `MOST_PHOTOGRAPHS` at most, evenly among those of `fitted` with a file."""
+    found = [int(k) for k in fitted if given.shots[k].files.filename]
+    count = min(len(found), MOST_PHOTOGRAPHS)
+    return [found[place * len(found) // count] for place in range(count)]
 
 
 def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray, width: int) -> int:
@@ -53,15 +60,16 @@ def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray, width: int
     `width`: of the photographs in the last stage of the fit [px].
     """
     extents = [shot.window.extent[0] if shot.window else shot.size[0]
-               for shot in (given.shots[k] for k in fitted) if shot.files.filename]  # fmt: skip
+               for shot in (given.shots[k] for k in used(given, fitted))]  # fmt: skip
     widest = min(WIDEST, max(extents, default=0))
     return widest if widest >= WORTH * width else 0
 
 
 def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray, width: int) -> float:
     """Estimate how long `sharpened` takes [s] on two cores. The arguments are those of `texture_width`."""
-    widest = texture_width(given, fitted, width)
-    return len(fitted) * (0.3 + 1.1e-6 * widest**2) if widest else 0.0
+    if not texture_width(given, fitted, width):
+        return 0.0
+    return sum(0.5 + 4e-8 * math.prod(given.shots[k].whole.size) for k in used(given, fitted))
 
 
 def at_width(given: Shot, refined: Shot, width: int) -> tuple[Shot, Shot]:
@@ -170,7 +178,7 @@ def sharpened(
         return ring
     predictor = Predictor(surface, ring, refined)
     vertices, normals, faces = predictor.vertices, predictor.normals, predictor.faces
-    given = [k for k in fitted if before.shots[k].files.filename]
+    given = used(before, fitted)
     shots = {k: at_width(before.shots[k], refined.shots[k], widest) for k in given}
     middle = ring.center.cpu().numpy()
     resolution = float(np.median([  # pixels of a photograph for a length of 1 in scene units
