@@ -47,7 +47,7 @@ SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
 
 
 def used(given: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
-    """Choose the photographs for the texture: `MOST_PHOTOGRAPHS` at most, evenly among those of `fitted` with a file."""
+    """Choose photographs for the texture: at most `MOST_PHOTOGRAPHS`, evenly among those of `fitted` with a file."""
     found = [int(k) for k in fitted if given.shots[k].files.filename]
     count = min(len(found), MOST_PHOTOGRAPHS)
     return [found[place * len(found) // count] for place in range(count)]
