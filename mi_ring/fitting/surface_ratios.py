@@ -76,14 +76,14 @@ class Ratios:
         """Return what both halves show as a grid with the channels red, green and blue; None if this is nothing.
 
         `s` (V, 3): vertices of the triangles, on the domain. `coarse`: what is larger is left out. `fine`: side of the
-        cubes of the grid. Call it once: it needs the memory of the sums.
+        cubes of the grid. Afterwards, the ratios are gone.
         """
-        values = self.agreed(LowPass(self.points, s, coarse))
+        values, weights = self.agreed(LowPass(self.points, s, coarse)), self.weights.sum(0)
+        del self.sums, self.weights  # before more memory is needed
         if values is None:
             return None
-        shown = self.weights.any(0)
-        at = torch.from_numpy(self.points.at(s.numpy())[shown])
-        values, weights = values[shown], self.weights.sum(0)[shown]
+        shown = weights > 0
+        at, values, weights = torch.from_numpy(self.points.at(s.numpy())[shown]), values[shown], weights[shown]
         grid = Grid.around(at, fine, 1, 3)
         (shares,), nodes = grid.weights(at), np.zeros((len(grid.keys(0)), 3), np.float32)
         total = np.maximum(shares.T @ weights, 1e-12)[:, None]
