@@ -158,6 +158,7 @@ class Remembered(nn.Module):
 
     def __init__(self, network: nn.Module, method: str = "forward") -> None:
         super().__init__()
+        self.learned = [p for p in network.parameters() if p.requires_grad]
         self.network: Any = network.requires_grad_(False)
         self.method = method
         self.last: tuple[Tensor, tuple, Tensor] | None = None  #: points, stamp and further arguments, result
@@ -173,6 +174,11 @@ class Remembered(nn.Module):
                 self.last = last = s.detach(), asked, getattr(self.network, self.method)(s, *more)
         return last[2]
 
+    def release(self) -> None:
+        """Let the network learn again as before. It is for a network whose details are removed."""
+        for parameter in self.learned:
+            parameter.requires_grad_(True)
+
 
 @register_network("detailed-flow")
 class DetailedFlow(Flow):
@@ -185,8 +191,13 @@ class DetailedFlow(Flow):
     grid: Grid
 
     def __init__(self, flow: dict, grid: dict) -> None:
-        """Make a flow without displacement. `flow`: result of `architecture_of`. `grid`: arguments of `Grid`."""
+        """Make a flow without displacement. `flow`: result of `architecture_of`. `grid`: arguments of `Grid`.
+
+        Raises ValueError if the grid has not one channel.
+        """
         super().__init__()
+        if grid["channels"] != 1:
+            raise ValueError(f"displacements of {grid['channels']} channels have no meaning")
         self.base, self.grid = Remembered(build(flow)), Grid(**grid)
         self.steps = self.base.network.steps
         for k, n in enumerate(grid["nodes"]):
@@ -237,9 +248,14 @@ class DetailedMaterial(MaterialNet):
     grid: Grid
 
     def __init__(self, net: dict, grid: dict) -> None:
-        """Make a network whose grid adds 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`."""
+        """Make a network whose grid adds 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`.
+
+        Raises ValueError if the grid has not one channel for each output of the network.
+        """
         made = build(net)
         super().__init__(made.bsdf_parameters)
+        if grid["channels"] != self.outputs:
+            raise ValueError(f"details of {grid['channels']} channels do not suit a material of {self.outputs}")
         self.base, self.grid = Remembered(made, "evaluate"), Grid(**grid)
 
     @classmethod
