@@ -120,6 +120,22 @@ def small(level=4):
     return ring
 
 
+def test_gradients_reach_the_points_as_without_details():
+    ring, s, step = small(), points_near(40).requires_grad_(), 1e-3
+    add_detail(ring, 3, 10)
+    ring.brdf_net = SharpenedMaterial.of(ring.brdf_net, Grid.around(points_near(), 0.2, 1, 3))
+    for grid in (ring.shape_net.grid, ring.brdf_net.base.grid, ring.brdf_net.grid):
+        for values in grid.values:
+            values.data = 0.3 * torch.randn(values.shape)
+    for function in (ring.surface, lambda s: ring.material(s)["diffuse"], lambda s: ring.brdf_net.fine(s)["diffuse"]):
+        (gradient,) = torch.autograd.grad(function(s).sum(), s)
+        with torch.no_grad():
+            ahead, behind = function(s + step * s), function(s - step * s)
+        expected = (ahead - behind).sum(1) / (2 * step)
+        error = (gradient * s).sum(1) - expected  # not where a cube ends between the two points
+        assert error.abs().median() < 0.01 * expected.abs().median()
+
+
 def test_without_values_nothing_changes_and_networks_are_fixed():
     ring, s = small(), points_near()
     before = ring(s)

@@ -111,15 +111,20 @@ class Grid(nn.Module):
         place = torch.searchsorted(keys, key).clamp(max=len(keys) - 1)
         share = (at - cube)[:, None]
         weight = torch.where(CORNERS == 1, share, 1 - share).prod(-1) * (keys[place] == key)
-        weight /= weight.sum(1, keepdim=True).clamp(min=0.5)  # small parts of the domain are in cubes without values
+        weight = weight / weight.sum(1, keepdim=True).clamp(min=0.5)  # some points are in cubes without values
         return weight.float(), place.int()
 
     def forward(self, s: Tensor, values: Sequence[Tensor] | None = None) -> Tensor:
         """Interpolate at points (V, 3): (V, channels). `values` (N, channels) of each octave replace the grid's own."""
         if len(s) > PART:
             return torch.cat([self(part, values) for part in s.split(PART)])
-        several = zip(self.weights(s), self.values if values is None else values)
-        return torch.stack([_Product.apply(own, weights) for weights, own in several]).sum(0)
+        values = list(self.values) if values is None else values
+        if moves(s):  # the sparse matrices have no gradient with respect to the points
+            around = [self.octave_weights(s.cpu(), k) for k in range(len(values))]
+            parts = [(weight[..., None].to(own) * own[node]).sum(1) for (weight, node), own in zip(around, values)]
+        else:
+            parts = [_Product.apply(own, weights) for weights, own in zip(self.weights(s), values)]
+        return torch.stack(parts).sum(0)
 
 
 class _Product(torch.autograd.Function):
@@ -134,6 +139,11 @@ class _Product(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         return torch.from_numpy(ctx.matrix.T @ gradient.numpy(force=True)).to(gradient.device), None
+
+
+def moves(s: Tensor) -> bool:
+    """Return True if somebody wants the gradient with respect to the points `s`. A fit does not."""
+    return s.requires_grad and torch.is_grad_enabled()
 
 
 def stamp(*tensors: Tensor) -> tuple:
@@ -168,6 +178,9 @@ class Remembered(nn.Module):
 
         If they and the network are those of the last call, this is the result of the last call.
         """
+        if moves(s):
+            with torch.autocast(s.device.type, enabled=False):
+                return getattr(self.network, self.method)(s, *more)
         last, asked = self.last, (stamp(s, *self.network.parameters(), *self.network.buffers()), more)
         if last is None or last[1] != asked:
             with torch.no_grad(), torch.autocast(s.device.type, enabled=False):
