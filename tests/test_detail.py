@@ -25,6 +25,7 @@ from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import compact, load_fit, ring_of, ring_state
 from mi_ring.objects.sharpened_material import SharpenedMaterial
+from mi_ring.output import results
 from mi_ring.system.files import write_state
 from mi_ring.system.machine import threads_of
 
@@ -507,6 +508,17 @@ def test_a_finished_fit_asks_for_a_texture_in_its_own_light(detailed, small_capt
     assert "no texture from larger photographs: 000.png" in capsys.readouterr().out
     Fit(load_capture(small_capture), SMALL, state=states[31]).result()  # not at its end
     assert len(asked) == 1
+
+
+def test_the_scene_shows_the_object_at_the_level_of_its_details(detailed, small_capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(results.report, "report_html", lambda *_: "")
+    monkeypatch.setattr(results, "viewed", lambda *_: None)
+    monkeypatch.setattr(result, "sharpened", lambda before, refined, surface, ring, *_: ring)
+    at_the_start = results.fitted_scene(load_capture(small_capture), small(), tmp_path)
+    results.write(tmp_path, detailed[0].result(), at_the_start)
+    level = detailed[0].ring.subdivisions
+    assert level != small().subdivisions
+    assert f'name="subdivisions" value="{level}"' in (tmp_path / "scene.xml").read_text()
 
 
 @pytest.mark.parametrize("kind", ["texture", "shape"])
