@@ -19,11 +19,14 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.optimisation import detail_steppers
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.geometry.domain import Domain, Sphere
-from mi_ring.nets.brdf_net import BRDFNet
+from mi_ring.nets.brdf_net import COOK_TORRANCE, BRDFNet
 from mi_ring.objects import detail
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.ring_file import compact, ring_of, ring_state
+from mi_ring.objects.ring_file import compact, load_fit, ring_of, ring_state
+from mi_ring.objects.sharpened_material import SharpenedMaterial
+from mi_ring.output import results
+from mi_ring.system.files import write_state
 from mi_ring.system.machine import threads_of
 
 
@@ -118,6 +121,22 @@ def small(level=4):
     return ring
 
 
+def test_gradients_reach_the_points_as_without_details():
+    ring, s, step = small(), points_near(40).requires_grad_(), 1e-3
+    add_detail(ring, 3, 10)
+    ring.brdf_net = SharpenedMaterial.of(ring.brdf_net, Grid.around(points_near(), 0.2, 1, 3))
+    for grid in (ring.shape_net.grid, ring.brdf_net.base.grid, ring.brdf_net.grid):
+        for values in grid.values:
+            values.data = 0.3 * torch.randn(values.shape)
+    for function in (ring.surface, lambda s: ring.material(s)["diffuse"], lambda s: ring.brdf_net.fine(s)["diffuse"]):
+        (gradient,) = torch.autograd.grad(function(s).sum(), s)
+        with torch.no_grad():
+            ahead, behind = function(s + step * s), function(s - step * s)
+        expected = (ahead - behind).sum(1) / (2 * step)
+        error = (gradient * s).sum(1) - expected  # not where a cube ends between the two points
+        assert error.abs().median() < 0.01 * expected.abs().median()
+
+
 def test_without_values_nothing_changes_and_networks_are_fixed():
     ring, s = small(), points_near()
     before = ring(s)
@@ -189,11 +208,21 @@ def two_channels(state):
     ]  # fmt: skip
 
 
+def four_channels(state):
+    state["brdf_net"]["arguments"]["grid"]["channels"] = 4
+    for k in range(4):
+        state["networks"][f"brdf_net.grid.values.{k}"] = state["networks"][f"brdf_net.grid.values.{k}"][:, :4]
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         (of_tensor("shape_net.grid.keys3", lambda keys: keys.flip(0)), "not in order"),
-        (of_tensor("brdf_net.grid.keys3", lambda keys: keys[:1].expand(len(keys))), "not in order"),
+        (of_tensor("brdf_net.grid.keys3", lambda keys: keys[:1].repeat(len(keys))), "not in order"),
+        (of_tensor("brdf_net.grid.keys3", lambda keys: keys[:1].expand(10**9)), "repeats"),
+        (lambda state: state["shape_net"]["arguments"].update(flow=copy.deepcopy(state["shape_net"])), "of details"),
+        (lambda state: state["brdf_net"]["arguments"].update(net=copy.deepcopy(state["brdf_net"])), "of details"),
+        (four_channels, "of 4 channels"),
         (of_tensor("shape_net.grid.keys0", lambda keys: keys + 2**30), "elsewhere"),
         (of_tensor("shape_net.grid.keys3", torch.Tensor.float), "another kind"),
         (of_tensor("shape_net.grid.values.3", torch.Tensor.int), "another kind"),
@@ -213,6 +242,40 @@ def test_damaged_details_are_refused(damage, message):
     damage(state)
     with pytest.raises(ValueError, match=message):
         ring_of(state)
+
+
+def textured(channels=3, nodes=None, depth=1, named="diffuse"):
+    """The state of an object whose material has a texture, in which some things may be wrong."""
+    ring = small()
+    ring.brdf_net.set_parameters([p._replace(name=named) if p.channels == 3 else p for p in COOK_TORRANCE], 1)
+    add_detail(ring, 3, 10)
+    state, grid = ring_state(ring), Grid.around(points_near(), 0.2, 1, channels)
+    for _ in range(depth):
+        places = {f"brdf_net.grid.{name}": value for name, value in grid.state_dict().items()}
+        places["brdf_net.scale"] = torch.tensor(1.0)
+        state["networks"] = {k.replace("brdf_net.", "brdf_net.base."): v for k, v in state["networks"].items()} | places
+        arguments = {"net": state["brdf_net"], "grid": grid.arguments() | ({"nodes": nodes} if nodes else {})}
+        state["brdf_net"] = {"name": "sharpened-material", "arguments": arguments}
+    return state
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"channels": 1}, "of 1 channels"), ({"nodes": [10**9]}, "sizes"), ({"depth": 100}, "details of details"),
+     ({"named": "transmittance"}, "does not suit")],
+)  # fmt: skip
+def test_damaged_textures_are_refused(wrong, message):
+    assert isinstance(ring_of(textured()).brdf_net, SharpenedMaterial)
+    with pytest.raises(ValueError, match=message):
+        ring_of(textured(**wrong))
+
+
+def test_a_number_without_end_is_refused_in_one_line(tmp_path):
+    state = textured()
+    state["brdf_net"]["arguments"]["grid"]["cell"] = 10**400
+    write_state(state, tmp_path / "ring.pt")
+    with pytest.raises(InputError, match=r"ring\.pt: damaged"):
+        load_fit(tmp_path)
 
 
 def test_materials_with_other_details_keep_their_own_weights():
@@ -447,6 +510,17 @@ def test_a_finished_fit_asks_for_a_texture_in_its_own_light(detailed, small_capt
     assert len(asked) == 1
 
 
+def test_the_scene_shows_the_object_at_the_level_of_its_details(detailed, small_capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(results.report, "report_html", lambda *_: "")
+    monkeypatch.setattr(results, "viewed", lambda *_: None)
+    monkeypatch.setattr(result, "sharpened", lambda before, refined, surface, ring, *_: ring)
+    at_the_start = results.fitted_scene(load_capture(small_capture), small(), tmp_path)
+    results.write(tmp_path, detailed[0].result(), at_the_start)
+    level = detailed[0].ring.subdivisions
+    assert level != small().subdivisions
+    assert f'name="subdivisions" value="{level}"' in (tmp_path / "scene.xml").read_text()
+
+
 @pytest.mark.parametrize("kind", ["texture", "shape"])
 def test_one_of_the_two(kind, small_capture):
     fit = Fit(load_capture(small_capture), dataclasses.replace(SMALL, detail=kind))
@@ -471,6 +545,7 @@ def test_details_that_do_not_help_are_removed(small_capture):
     fit.step()
     assert "detail" in fit.course.validation["put_back"]
     assert fit.ring.shape_net is smooth
+    assert all(parameter.requires_grad for parameter in fit.ring.parameters())  # as without details
     again = Fit(load_capture(small_capture), fit.problem.config, state=fit.state())
     assert again.iteration == again.iterations
     s = points_near()

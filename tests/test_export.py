@@ -1,12 +1,15 @@
 """Files for other programs: what they say of the surface and of its material, read by others than their writer."""
 
+import errno
 import json
 import math
 import os
+import re
 import shutil
 import struct
 import subprocess
 import sys
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -444,6 +447,24 @@ def test_obj_of_principled_keeps_metal_and_gloss(tmp_path):
     metal = np.asarray(Image.open(tmp_path / "o_metallic.png")) / 255
     expected = atlas.reflectances(ring, ring.domain.sample(4)[0].numpy())["metallic"]
     assert abs(metal.mean() - expected.mean()) < 0.05 and abs(metal.max() - expected.max()) < 0.05
+
+
+@pytest.mark.parametrize("kind, fails", [("xml", "f_alpha.exr"), ("obj", "f.obj")])
+def test_a_full_disk_leaves_no_part_of_an_export(ring, run, tmp_path, monkeypatch, kind, fails):
+    """And what an earlier export has left stays whole: its textures would not suit another mesh."""
+    (tmp_path / "f_object.ply").write_text("as before")
+    replace = os.replace
+
+    def full(source, target):
+        if Path(target).name == fails:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr("mi_ring.system.files.os.replace", full)
+    with pytest.raises(InputError, match=rf"{re.escape(str(tmp_path / fails))}: cannot be written .No space"):
+        export.main([str(run), str(tmp_path / f"f.{kind}"), "--subdivisions", "1", "--resolution", "64"])
+    assert [file.name for file in tmp_path.iterdir()] == ["f_object.ply"]
+    assert (tmp_path / "f_object.ply").read_text() == "as before"
 
 
 def test_ply_at_time_0_is_the_domain(run, tmp_path):

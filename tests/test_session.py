@@ -87,6 +87,15 @@ def test_the_second_ctrl_c_says_how_to_go_on(small_capture, tmp_path, monkeypatc
     assert capsys.readouterr().out.endswith("has a checkpoint: go on with the same command and --resume\n")
 
 
+def test_a_photograph_that_changes_during_the_fit_is_named(small_capture, tmp_path, monkeypatch, capsys):
+    scene = Path(shutil.copytree(small_capture.parent, tmp_path / "capture")) / small_capture.name
+    photograph = sorted(scene.parent.glob("images/*"))[0]
+    monkeypatch.setattr(results, "write_log", lambda *_: photograph.write_bytes(photograph.read_bytes() + b"0"))
+    monkeypatch.setattr(results, "write", lambda *_: None)
+    fit.main([str(scene), "--out", str(tmp_path / "run"), "--iterations", "2", *SPHERE])
+    assert f"images/{photograph.name}: changed while the fit ran" in capsys.readouterr().out
+
+
 @pytest.mark.skipif(os.name != "posix", reason="Windows has other signals")
 def test_the_signal_of_a_terminal_that_closes_loses_nothing(small_capture, tmp_path, begun):
     """However often they come; nor does a reader of the output that is gone, of which nobody hears then."""

@@ -296,6 +296,13 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
     return scene_bytes(root)
 
 
+def at_level(scene: bytes, level: int) -> bytes:
+    """Return new content for the scene file of a fit, whose object has a mesh of this `level`. `scene`: the old one."""
+    root = ElementTree.fromstring(scene)
+    next(e for e in root.iter("integer") if e.get("name") == "subdivisions").set("value", str(level))
+    return scene_bytes(root)
+
+
 def bsdf_element(root: Element, path: Path) -> tuple[Element, Element]:
     """Find the BSDF of the `shapenet` in a scene. Returns (element in the `shapenet`, <bsdf> element).
 

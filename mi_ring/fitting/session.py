@@ -113,12 +113,21 @@ class Keeper:
         """
         if not self.writes:
             return
+        self.warn_of_changes()
         result = self.fit.result()
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             results.write(self.folder, result, fitted_scene)
         except (InputError, OSError) as error:
             raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(result, fitted_scene)}") from error
+
+    def warn_of_changes(self) -> None:
+        """Print which input files have changed since the fit began. The results are made from both contents then."""
+        with contextlib.suppress(OSError):  # a file that has gone is reported where it is needed
+            now = digests(self.fit.problem.given, self.fit.problem.config)
+            if changed := [name for name, content in now.items() if content != self.files.get(name)]:
+                print(f"{', '.join(sorted(changed))}: changed while the fit ran; texture and report are not those of "
+                      "the photographs that it has seen; fit again")  # fmt: skip
 
     def rescue(self, result: FitResult, fitted_scene: bytes) -> str:
         """Write as much as possible of checkpoint and results to a new temporary folder.

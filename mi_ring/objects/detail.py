@@ -113,15 +113,20 @@ class Grid(nn.Module):
         place = torch.searchsorted(keys, key).clamp(max=len(keys) - 1)
         share = (at - cube)[:, None]
         weight = torch.where(CORNERS == 1, share, 1 - share).prod(-1) * (keys[place] == key)
-        weight /= weight.sum(1, keepdim=True).clamp(min=0.5)  # small parts of the domain are in cubes without values
+        weight = weight / weight.sum(1, keepdim=True).clamp(min=0.5)  # some points are in cubes without values
         return weight.float(), place.int()
 
     def forward(self, s: Tensor, values: Sequence[Tensor] | None = None) -> Tensor:
         """Interpolate at points (V, 3): (V, channels). `values` (N, channels) of each octave replace the grid's own."""
         if len(s) > PART:
             return torch.cat([self(part, values) for part in s.split(PART)])
-        several = zip(self.weights(s), self.values if values is None else values)
-        return torch.stack([_Product.apply(own, weights) for weights, own in several]).sum(0)
+        values = list(self.values) if values is None else values
+        if moves(s):  # the sparse matrices have no gradient with respect to the points
+            around = [self.octave_weights(s.cpu(), k) for k in range(len(values))]
+            parts = [(weight[..., None].to(own) * own[node]).sum(1) for (weight, node), own in zip(around, values)]
+        else:
+            parts = [_Product.apply(own, weights) for weights, own in zip(self.weights(s), values)]
+        return torch.stack(parts).sum(0)
 
 
 class _Product(torch.autograd.Function):
@@ -136,6 +141,11 @@ class _Product(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         return torch.from_numpy(ctx.matrix.T @ gradient.numpy(force=True)).to(gradient.device), None
+
+
+def moves(s: Tensor) -> bool:
+    """Return True if somebody wants the gradient with respect to the points `s`. A fit does not."""
+    return s.requires_grad and torch.is_grad_enabled()
 
 
 def stamp(*tensors: Tensor) -> tuple:
@@ -160,6 +170,7 @@ class Remembered(nn.Module):
 
     def __init__(self, network: nn.Module, method: str = "forward") -> None:
         super().__init__()
+        self.learned = [p for p in network.parameters() if p.requires_grad]
         self.network: Any = network.requires_grad_(False)
         self.method = method
         self.last: tuple[Tensor, tuple, Tensor] | None = None  #: points, stamp and further arguments, result
@@ -169,11 +180,19 @@ class Remembered(nn.Module):
 
         If they and the network are those of the last call, this is the result of the last call.
         """
+        if moves(s):
+            with torch.autocast(s.device.type, enabled=False):
+                return getattr(self.network, self.method)(s, *more)
         last, asked = self.last, (stamp(s, *self.network.parameters(), *self.network.buffers()), more)
         if last is None or last[1] != asked:
             with torch.no_grad(), torch.autocast(s.device.type, enabled=False):
                 self.last = last = s.detach(), asked, getattr(self.network, self.method)(s, *more)
         return last[2]
+
+    def release(self) -> None:
+        """Let the network learn again as before. It is for a network whose details are removed."""
+        for parameter in self.learned:
+            parameter.requires_grad_(True)
 
 
 @register_network("detailed-flow")
@@ -187,8 +206,13 @@ class DetailedFlow(Flow):
     grid: Grid
 
     def __init__(self, flow: dict, grid: dict) -> None:
-        """Make a flow without displacement. `flow`: result of `architecture_of`. `grid`: arguments of `Grid`."""
+        """Make a flow without displacement. `flow`: result of `architecture_of`. `grid`: arguments of `Grid`.
+
+        Raises ValueError if the grid has not one channel.
+        """
         super().__init__()
+        if grid["channels"] != 1:
+            raise ValueError(f"displacements of {grid['channels']} channels have no meaning")
         self.base, self.grid = Remembered(build(flow)), Grid(**grid)
         self.steps = self.base.network.steps
         for k, n in enumerate(grid["nodes"]):
@@ -239,9 +263,14 @@ class DetailedMaterial(MaterialNet):
     grid: Grid
 
     def __init__(self, net: dict, grid: dict) -> None:
-        """Make a network whose grid adds 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`."""
+        """Make a network whose grid adds 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`.
+
+        Raises ValueError if the grid has not one channel for each output of the network.
+        """
         made = build(net)
         super().__init__(made.bsdf_parameters)
+        if grid["channels"] != self.outputs:
+            raise ValueError(f"details of {grid['channels']} channels do not suit a material of {self.outputs}")
         self.base, self.grid = Remembered(made, "evaluate"), Grid(**grid)
 
     @classmethod

@@ -22,6 +22,8 @@ from mi_ring.version import __version__
 FORMAT = 4  #: version of the file format
 MAX_LEVEL, MAX_STEPS = 8, 10_000  #: of the mesh; Euler steps
 ADVICE = "give the results folder of a fit, or its ring.pt"
+DETAILS = "detailed-flow", "detailed-material", "sharpened-material"  #: networks that add a grid to another network
+TEXTURED = "sharpened-material", "detailed-material"  #: the only one of these that may be in another
 
 
 def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
@@ -59,9 +61,12 @@ def ring_of(state: dict) -> FittedObject:
         arguments = dict(shape_net["arguments"])
         refuse("solver", arguments.pop("solver", "euler"), "euler")
         shape_net = {**shape_net, "arguments": arguments}
+    for tensor in [*state["networks"].values(), *(state["domain"] or {}).values()]:
+        if isinstance(tensor, torch.Tensor):  # not a few numbers that stand for many, as `expand` makes them
+            require(tensor.nbytes <= tensor.untyped_storage().nbytes(), "a tensor repeats its numbers")
     domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
     for name in ("shape_net", "brdf_net"):
-        require_grid(state["networks"], name, state[name])
+        require_grids(state["networks"], name, state[name])
     material = state["brdf_net"]
     while "net" in material["arguments"]:  # without details and texture
         material = material["arguments"]["net"]
@@ -90,18 +95,24 @@ def refuse(name: str, found: object, supported: str) -> None:
                          "that wrote this file")  # fmt: skip
 
 
-def require_grid(networks: dict, name: str, architecture: dict) -> None:
-    """Raise ValueError if details have other sizes than their file says. Memory for wrong sizes is not allocated.
+def require_grids(networks: dict, name: str, architecture: dict) -> None:
+    """Raise ValueError if details have other sizes than their file says, or are details of others.
 
-    `networks`: tensors of the file by name. `name`: "shape_net" or "brdf_net". `architecture`: its description.
+    So memory for wrong sizes is not allocated. `networks`: tensors of the file by name. `name`: "shape_net" or
+    "brdf_net". `architecture`: its description.
     """
-    if architecture["name"] == "sharpened-material":
-        require_grid(networks, f"{name}.base", architecture["arguments"]["net"])
-    if architecture["name"] in ("detailed-flow", "detailed-material", "sharpened-material"):
-        grid, start = architecture["arguments"]["grid"], f"{name}.grid."
-        nodes = [len(value) for key, value in networks.items() if key.startswith(f"{start}keys")]
-        found = nodes, networks[f"{start}values.0"].shape[1]
-        require(found == (grid["nodes"], grid["channels"]), f"the details of {name} have other sizes than it says")
+    kind, arguments = architecture["name"], architecture["arguments"]
+    if kind not in DETAILS:
+        return
+    grid, inner = arguments["grid"], arguments["flow" if kind == "detailed-flow" else "net"]
+    values = [value for key, value in networks.items() if key.startswith(f"{name}.grid.values.")]
+    keys = [value for key, value in networks.items() if key.startswith(f"{name}.grid.keys")]
+    found = [tuple(value.shape) for value in (*keys, *values)]
+    stated = [(n,) for n in grid["nodes"]] + [(n, grid["channels"]) for n in grid["nodes"]]
+    right = found == stated and min(grid["nodes"], default=0) > 0
+    require(right, f"the details of {name} have other sizes than it says")
+    require(inner["name"] not in DETAILS or (kind, inner["name"]) == TEXTURED, f"{name} has details of details")
+    require_grids(networks, f"{name}.base", inner)
 
 
 def require_valid(ring: FittedObject) -> None:
@@ -200,5 +211,5 @@ def load_fit(path: str | Path) -> FittedObject:
         return ring_of(upgraded(state) if version == 3 else state)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (AttributeError, IndexError, KeyError, TypeError, RuntimeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, RuntimeError, ValueError) as error:
         raise InputError(f"{path}: damaged, or its networks do not match their names ({error!r})") from error

@@ -15,9 +15,14 @@ class SharpenedMaterial(MaterialNet):
     """The material of another network, whose albedo is multiplied by a texture: exp(grid)."""
 
     def __init__(self, net: dict, grid: dict) -> None:
-        """Make a material whose grid is 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`."""
+        """Make a material whose grid is 0. `net`: result of `architecture_of`. `grid`: arguments of `Grid`.
+
+        Raises ValueError if the material has no colour without gloss, or if the grid has not three channels.
+        """
         base = build(net)
         super().__init__(base.bsdf_parameters)
+        if not albedo_of(self) or grid["channels"] != 3:
+            raise ValueError(f"a texture of {grid['channels']} channels does not suit the material")
         self.base: Any = base
         self.grid = Grid(**grid)
 

@@ -17,7 +17,7 @@ from mi_ring.output.obj import write_obj
 from mi_ring.output.ply import write_mesh
 from mi_ring.scene.shot import Shot
 from mi_ring.scene.visibility import MaskedCamera
-from mi_ring.system.files import require_place, write_file
+from mi_ring.system.files import all_or_none, require_place, write_file
 
 KINDS = ".ply", ".obj", ".glb", ".xml"
 GLB_LEVEL = 5  #: of its mesh; finer detail is in the normal map
@@ -64,9 +64,12 @@ def export(
     atlas = unwrap(ring, level, resolution, time)
     texels = rasterise(ring, atlas, resolution, time)
     values = reflectances(ring, texels.s)
-    if kind == ".xml" and photograph is not None:
-        return write_scene(file, atlas, texels, ring.bsdf, values, *photograph)
-    return write_obj(file, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
+    with all_or_none(file) as new:
+        if kind == ".xml" and photograph is not None:
+            files = write_scene(new, atlas, texels, ring.bsdf, values, *photograph)
+        else:
+            files = write_obj(new, atlas, texels, gltf.metallic_roughness(ring.bsdf, values))
+    return [file.with_name(made.name) for made in files]
 
 
 def resolution_of(ring: FittedObject) -> int:

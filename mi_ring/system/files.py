@@ -205,3 +205,20 @@ def whole_folder(folder: Path) -> Iterator[Path]:
             os.replace(growing, folder)
         finally:
             shutil.rmtree(growing, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def all_or_none(path: Path) -> Iterator[Path]:
+    """A context manager for several files that belong together. Yields the path to write instead of `path`.
+
+    The other files are written beside it. At the end, all move to the folder of `path`, `path` itself last. After an
+    error, all that was there before stays as it was. Raises InputError if something cannot be written.
+    """
+    with writing(path), tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
+        folder = Path(name)
+        try:
+            yield folder / path.name
+        except InputError as error:
+            raise InputError(str(error).replace(str(folder), str(path.parent))) from error
+        for file in sorted(folder.iterdir(), key=lambda file: file.name == path.name):
+            os.replace(file, path.with_name(file.name))
