@@ -1,4 +1,4 @@
-"""Textures from photographs that are larger than those of the fit."""
+"""Textures from photographs at their own size, which may be larger than those of the fit."""
 
 from dataclasses import replace
 
@@ -204,13 +204,25 @@ def test_it_is_in_the_file_and_edits_reach_it(sharp):
     np.testing.assert_allclose(halved, np.tile([0.5, 1, 1], (500, 1)), atol=0.02)
 
 
-@pytest.mark.parametrize(("width", "fitted"), [(160, range(12)), (140, range(12)), (40, [])])
-def test_nothing_changes_without_larger_photographs(print_scene, width, fitted):
-    ring, capture = pale_ball(), load_capture(print_scene, width=width)
-    assert sharpened(capture, ring, width, fitted) is ring
-    assert fine_texture.texture_seconds(capture, fitted, width) == 0
-    twice, once = (fine_texture.texture_seconds(capture, range(n), 40) for n in (12, 6))
+def test_nothing_changes_without_photographs(print_scene):
+    ring, capture = pale_ball(), load_capture(print_scene, width=40)
+    assert sharpened(capture, ring, 40, []) is ring
+    assert fine_texture.texture_seconds(capture, []) == 0
+    twice, once = (fine_texture.texture_seconds(capture, range(n)) for n in (12, 6))
     assert twice == 2 * once > 0
+
+
+def test_photographs_as_small_as_those_of_the_fit_count(tmp_path):
+    """Waves of 6 pixels, of which the fit has found nothing."""
+
+    def fine_print(points):
+        return PALE * (1 + 0.3 * np.sin(66 * points[:, :1]))
+
+    ring = sharpened(load_capture(photographed(tmp_path, fine_print)), pale_ball(), 160)
+    s = on_the_ball()
+    found, true = reflectances(ring, s)["diffuse"] / MATTE - 1, fine_print(s) / PALE - 1
+    wide = np.abs(s[:, 0]) < 0.5  # elsewhere they are longer
+    assert (found * true)[wide].sum() / (true**2)[wide].sum() == pytest.approx(1, abs=0.25)
 
 
 def test_of_many_photographs_some_are_used(print_scene, monkeypatch):
@@ -218,7 +230,7 @@ def test_of_many_photographs_some_are_used(print_scene, monkeypatch):
     monkeypatch.setattr(fine_texture, "MOST_PHOTOGRAPHS", 4)
     assert fine_texture.used(capture, range(12)) == [0, 3, 6, 9]
     assert fine_texture.used(capture, [1, 5, 6]) == [1, 5, 6]
-    assert fine_texture.texture_seconds(capture, range(12), 40) == fine_texture.texture_seconds(capture, range(4), 40)
+    assert fine_texture.texture_seconds(capture, range(12)) == fine_texture.texture_seconds(capture, range(4))
 
 
 @pytest.mark.parametrize("name", ["masks", "valid"])

@@ -1,7 +1,7 @@
-"""Colours finer than the photographs of the fit, from the photographs at their own size.
+"""A texture: colours as fine as the photographs, which may be larger than the fit has seen them.
 
-After a fit, surface, light and material are known. The photographs may be larger than the fit has seen them. The ratio
-of such a photograph to its prediction, without highlights, is what the fitted colours lack. Each point of the surface
+After a fit, surface, light and material are known. The ratio of a photograph to its prediction, without highlights, is
+what the fitted colours lack. Each point of the surface
 gets the mean ratio of the photographs that show it, as in the texture mapping of photogrammetry. Shading is divided
 out, so the colours stay free of light. Coarse differences are left out: they are errors of light or shape.
 """
@@ -36,7 +36,6 @@ from mi_ring.system.progress import progress
 
 WIDEST = 2048  #: to which photographs are reduced for the texture [px]
 PREDICTED = 1024  #: largest width of a prediction, which shows nothing finer than the fit [px]
-WORTH = 1.3  #: the photographs must be wider than those of the fit by this factor
 CELL = 1.2  #: side of the cubes of the texture [px]
 COARSE = 8.0  #: differences that are coarser than this are left out [px of the fit]
 MOST_POINTS, MOST_PHOTOGRAPHS = 8_000_000, 80
@@ -53,22 +52,17 @@ def used(given: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
     return [found[place * len(found) // count] for place in range(count)]
 
 
-def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray, width: int) -> int:
-    """Choose the width to which photographs are reduced for the texture [px]. Returns 0 if it would not be finer.
+def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray) -> int:
+    """Choose the width to which photographs are reduced for the texture [px]. Returns 0 if there are none.
 
     `given`: the capture of the fit, which may be reduced. `fitted`: indices of its photographs that are fitted.
-    `width`: of the photographs in the last stage of the fit [px].
     """
-    extents = [shot.window.extent[0] if shot.window else shot.size[0]
-               for shot in (given.shots[k] for k in used(given, fitted))]  # fmt: skip
-    widest = min(WIDEST, max(extents, default=0))
-    return widest if widest >= WORTH * width else 0
+    shots = [given.shots[k] for k in used(given, fitted)]
+    return min(WIDEST, max((shot.window.extent[0] if shot.window else shot.size[0] for shot in shots), default=0))
 
 
-def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray, width: int) -> float:
+def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray) -> float:
     """Estimate how long `sharpened` takes [s] on two cores. The arguments are those of `texture_width`."""
-    if not texture_width(given, fitted, width):
-        return 0.0
     return sum(0.5 + 4e-8 * math.prod(given.shots[k].whole.size) for k in used(given, fitted))
 
 
@@ -166,14 +160,14 @@ def sharpened(
     before: Capture, refined: Capture, surface: Surface, ring: FittedObject, fitted: Sequence[int] | np.ndarray,
     width: int,
 ) -> FittedObject:  # fmt: skip
-    """Return a copy of an object whose colours have a texture from larger photographs, or the object itself.
+    """Return a copy of an object whose colours have a texture from the photographs, or the object itself.
 
-    It is the object itself if no photograph is larger than the fit has seen it, if they show nothing finer, or if the
-    material has no albedo. `before`, `refined`: the capture before and after the calibration by the fit. `surface`:
+    It is the object itself if the photographs show nothing that its colours lack, or if the material has no albedo.
+    `before`, `refined`: the capture before and after the calibration by the fit. `surface`:
     shows the object `ring`, in the light of the fit. `fitted`: indices of the photographs to use. `width`: of the
     photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
-    widest = texture_width(before, fitted, width)
+    widest = texture_width(before, fitted)
     if not widest or not albedo_of(ring.brdf_net.bsdf_parameters):
         return ring
     predictor = Predictor(surface, ring, refined)
@@ -210,7 +204,9 @@ def sharpened(
 
     for _ in progress(pipelined(predicted, compare, given), "fine texture", len(given)):
         pass
-    grid = ratios.texture(predictor.s, COARSE * widest / width / scale, CELL * max(1.0, wanted / divisions) / scale)
+    grid = ratios.texture(
+        predictor.s, COARSE * max(1.0, widest / width) / scale, CELL * max(1.0, wanted / divisions) / scale
+    )
     if grid is None:
         return ring
     return FittedObject(

@@ -28,7 +28,7 @@ def result_of(
 ) -> FitResult:  # fmt: skip
     """Collect the results of a fit, from which files are written later. Writes no files, but evaluates the surface.
 
-    At the end of a fit with details, the material first gets a texture from larger photographs, if there are any.
+    At the end of a fit with details, the material first gets a texture.
 
     `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: share of the
     observed light that recent predictions do not explain.
@@ -44,7 +44,7 @@ def result_of(
             shown = renderer.show(model, ring.subdivisions)
             ring = sharpened(capture, refined, shown, ring, problem.fitted, max(problem.config.widths))
         except InputError as error:  # a file has gone; all else can be saved
-            print(f"There is no texture from larger photographs: {error}")
+            print(f"There is no texture: {error}")
     return FitResult(
         ring=ring,
         surface=renderer.show(model, ring.subdivisions),
