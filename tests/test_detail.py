@@ -505,7 +505,7 @@ def test_a_finished_fit_asks_for_a_texture_in_its_own_light(detailed, small_capt
     fit, states = detailed
     assert fit.result().ring is fit.ring  # all else can be saved
     assert asked == [(fit.renderer.surface, fit.ring, 12, SMALL.widths[-1])]
-    assert "no texture from larger photographs: 000.png" in capsys.readouterr().out
+    assert "no texture: 000.png" in capsys.readouterr().out
     Fit(load_capture(small_capture), SMALL, state=states[31]).result()  # not at its end
     assert len(asked) == 1
 
