@@ -20,7 +20,7 @@ from mi_ring.system.progress import progress
 
 MAX_CUT_LEVEL = 5  #: finest level that is unwrapped: the time grows with the square of the number of triangles
 PADDING = 4  #: between charts [texels]
-CHUNK = 2**17  #: texels that the networks evaluate at once
+CHUNK = 2**17  #: texels that are computed at once
 
 
 class Atlas(NamedTuple):
@@ -148,29 +148,35 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
     finer = len(faces) > len(atlas.faces)
     normals = seamless_surface(ring, s, faces, time)[1] if finer else atlas.normals
 
-    flat = mesh_of(np.pad(uv, ((0, 0), (0, 1))), faces, normals=False)
-    y, x = np.mgrid[:resolution, :resolution].reshape(2, -1)
-    centre = mi.Point3f(*(to_flat(mi.Float, (k + 0.5) / resolution) for k in (x, y)), 1)
-    rays = mi.Ray3f(centre, mi.Vector3f(0, 0, -1))
-    hit = mi.load_dict({"type": "scene", "atlas": flat}).ray_intersect_preliminary(rays)
-    inside = np.array(hit.is_valid())
-    corners = faces[np.array(hit.prim_index)[inside]]
-    b = np.array(hit.prim_uv).T[inside]
-    weights = np.stack([1 - b.sum(1), b[:, 0], b[:, 1]], 1)[..., None]
+    scene = mi.load_dict({"type": "scene", "atlas": mesh_of(np.pad(uv, ((0, 0), (0, 1))), faces, normals=False)})
+    inside = np.zeros((resolution, resolution), bool)
+    parts = []
+    for rows in np.array_split(np.arange(resolution), -(-(resolution**2) // CHUNK)):
+        y, x = np.meshgrid(rows, np.arange(resolution), indexing="ij")
+        centre = mi.Point3f(*(to_flat(mi.Float, (k + 0.5) / resolution) for k in (x, y)), 1)
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(centre, mi.Vector3f(0, 0, -1)))
+        shown = np.array(hit.is_valid())
+        inside[rows] = shown.reshape(x.shape)
+        corners = faces[np.array(hit.prim_index)[shown]]
+        b = np.array(hit.prim_uv).T[shown]
+        weights = np.stack([1 - b.sum(1), b[:, 0], b[:, 1]], 1)[..., None]
+        found = [(values[corners] * weights).sum(1) for values in (s, normals, *frame)]
+        parts.append((found[0].astype(np.float32), in_frame(*found[1:]).astype(np.float32)))
+    number = np.cumsum(inside, dtype=np.int32).reshape(inside.shape) - 1
+    nearest = scipy.ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    points, local = map(np.concatenate, zip(*parts))
+    return Texels(points, local, number[tuple(nearest)])
 
-    def at(values: np.ndarray) -> np.ndarray:
-        return (values[corners] * weights).sum(1).astype(np.float32)
 
-    n, t, b, m = at(frame[2]), at(frame[0]), at(frame[1]), at(normals)
-    # Solve m = x t + y b + z n, which a renderer computes with the interpolated frame.
+def in_frame(m: np.ndarray, t: np.ndarray, b: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """Return the vectors (N, 3) that a renderer turns into the directions `m` (N, 3), as unit vectors.
+
+    It computes x t + y b + z n, where `t`, `b`, `n` (N, 3) are tangent, bitangent and normal of the mesh, interpolated.
+    """
     n, t, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (n, t, b))
     local = np.stack([(np.cross(p, q) * m).sum(1) for p, q in ((b, n), (n, t), (t, b))], 1)
     local *= np.sign((np.cross(b, n) * t).sum(1, keepdims=True))
-    local /= np.linalg.norm(local, axis=1, keepdims=True)
-    inside = inside.reshape(resolution, resolution)
-    number = np.cumsum(inside).reshape(inside.shape) - 1
-    nearest = scipy.ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    return Texels(at(s), local, number[tuple(nearest)])
+    return local / np.linalg.norm(local, axis=1, keepdims=True)
 
 
 def reflectances(ring: FittedObject, s: np.ndarray) -> dict[str, np.ndarray]:

@@ -95,12 +95,12 @@ def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
     """
     ones = np.ones_like(material.roughness)
     images = {
-        "baseColorTexture": linear_to_srgb(material.base_color),
-        "metallicRoughnessTexture": np.stack([ones, material.roughness, material.metallic], 1),
-        "specularTexture": np.stack([ones, ones, ones, material.specular], 1),
-        "normalTexture": 0.5 * texels.normals + 0.5,
+        "baseColorTexture": to_bytes(linear_to_srgb(material.base_color)),
+        "metallicRoughnessTexture": to_bytes(np.stack([ones, material.roughness, material.metallic], 1)),
+        "specularTexture": to_bytes(np.stack([ones, ones, ones, material.specular], 1)),
+        "normalTexture": to_bytes(0.5 * texels.normals + 0.5),
     }
-    return {name: to_bytes(image)[texels.index] for name, image in images.items()}
+    return {name: image[texels.index] for name, image in images.items()}
 
 
 def glb(
