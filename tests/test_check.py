@@ -1,6 +1,7 @@
 """`mi_ring.check`: a good capture passes, each mistake is named with its mend."""
 
 import re
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -279,6 +280,18 @@ def test_light_of_the_room_is_told_from_the_falloff():
         share = capture_findings.room_light(albedo * (received + room) / received, received)
         assert share == pytest.approx(room / (np.median(received) + room), abs=0.05)
     assert capture_findings.room_light(albedo * 1.15, np.ones(24)) == 0  # all from one distance
+
+
+@pytest.mark.parametrize(("clipped", "found"), [(0.0, True), (0.2, False)])
+def test_over_exposed_photographs_do_not_tell_the_light_of_the_room(small_capture, monkeypatch, clipped, found):
+    """All are equally bright, whatever the distance of the flash."""
+    capture = load_capture(small_capture)
+    received = np.linspace(1, 2, len(capture))
+    monkeypatch.setattr(capture_findings, "received_by", lambda capture, center: received)
+    rows = [replace(row, brightness=1 / e, clipped=clipped, angle=5.0)
+            for row, e in zip(capture_findings.measure(capture, np.zeros(3), 1.0, {}), received)]  # fmt: skip
+    text = "\n".join(capture_findings.capture_findings(capture, rows, np.zeros(3)))
+    assert ("as if 100% of the light came from the room, or" in text) == found
 
 
 def test_without_masks(broken_capture, tmp_path, capsys):

@@ -166,7 +166,8 @@ def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
 
     `received` (n,): irradiance at the object by the known lights, in each photograph. `brightness` (n,): brightness of
     the object in each photograph, divided by `received`. Room light does not depend on the distance of the flash. So if
-    there is room light, the object looks too bright where `received` is small.
+    there is room light, the object looks too bright where `received` is small. So does it if the camera's curve is
+    flatter than assumed.
     """
     if len(received) < 12 or received.max() < 1.5 * received.min():
         return 0.0
@@ -217,10 +218,12 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     if not any(capture.masks.given) and dark_threshold(capture) is None:
         found.append("no masks, and the background is not dark, which a fit without masks needs: give masks, or "
                      "find them with mi-ring photos")  # fmt: skip
-    share = room_light(np.array([row.brightness for row in lit]), received[[row in lit for row in rows]])
+    exposed = [row in lit and row.clipped < CLIPPED for row in rows]  # the brightness of the others is not known
+    share = room_light(np.array([row.brightness for row in rows])[exposed], received[exposed])
     if share > AMBIENT:
-        found.append(f"{share:.0%} of the light on the object comes from the room: the object is hardly darker if the "
-                     "flash is farther away; darken the room, or go nearer")  # fmt: skip
+        found.append(f"the object is hardly darker if the flash is farther away: as if {share:.0%} of the light came "
+                     "from the room, or the camera's curve were flatter; darken the room, or give the photographs "
+                     "their gamma")  # fmt: skip
     if (views := len({shot.camera.to_world.tobytes() for shot in capture.shots})) < 8:
         found.append(f"{views} views are too few: a closed surface needs about 30 from all sides")
     return found
