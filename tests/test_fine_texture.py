@@ -157,6 +157,33 @@ def test_pictures_and_maps_show_it(sharp, print_scene):
     np.testing.assert_allclose((diffuse / MATTE)[inside], pictures[0][inside] / plain[inside], rtol=0.1)
 
 
+def test_it_is_as_strong_at_outlines(print_scene):
+    """A texture that doubles the albedo doubles the pixels of a matte ball."""
+    capture, ring = load_capture(print_scene), pale_ball()
+    surface = Surface(capture.scene, capture.shape, ring)
+    surface.show(ring, *ring.domain.sample(5))
+    plain, coverage = prediction.draw(surface, capture.photograph(0))
+    surface.texture, surface.s = lambda s: torch.full_like(s, 2.0), ring.domain.sample(5)[0]
+    double, _ = prediction.draw(surface, capture.photograph(0))
+    outline = (coverage > 0.3) & (coverage < 0.9) & (plain > 0).all(-1)
+    assert outline.sum() > 50
+    ratio = double[outline] / plain[outline]
+    assert np.quantile(ratio, 0.1) == pytest.approx(2)  # four rays may miss where others have hit
+    with torch.no_grad():
+        surface.write(*ring(surface.s))
+    assert surface.texture is None  # it belongs to what `show` has shown
+
+
+def test_a_photograph_that_misses_the_object_does_no_harm(print_scene):
+    capture = load_capture(print_scene, width=40)
+    shot = capture.shots[3]
+    turned = shot.camera.to_world.copy()
+    turned[:3, :3] = turned[:3, :3] @ np.diag([-1, 1, -1])
+    away = replace(shot, camera=shot.camera._replace(to_world=turned))
+    changed = replace(capture, shots=[*capture.shots[:3], away, *capture.shots[4:]])
+    assert isinstance(sharpened(changed, pale_ball()).brdf_net, SharpenedMaterial)
+
+
 def test_it_does_not_change_highlights(sharp, print_scene):
     """Where nothing is matte, there is nothing to see of a texture."""
     capture, ring = load_capture(print_scene), ring_of(ring_state(sharp))
@@ -228,8 +255,8 @@ def test_photographs_as_small_as_those_of_the_fit_count(tmp_path):
 def test_of_many_photographs_some_are_used(print_scene, monkeypatch):
     capture = load_capture(print_scene, width=40)
     monkeypatch.setattr(fine_texture, "MOST_PHOTOGRAPHS", 4)
-    assert fine_texture.used(capture, range(12)) == [0, 3, 6, 9]
-    assert fine_texture.used(capture, [1, 5, 6]) == [1, 5, 6]
+    assert fine_texture.chosen_photographs(capture, range(12)) == [0, 3, 6, 9]
+    assert fine_texture.chosen_photographs(capture, [1, 5, 6]) == [1, 5, 6]
     assert fine_texture.texture_seconds(capture, range(12)) == fine_texture.texture_seconds(capture, range(4))
 
 
@@ -261,7 +288,7 @@ def test_highlights_are_subtracted_and_strong_ones_left_out(print_scene):
     mask = torch.ones(whole.shape[:3])
     seen = Observation(highlights + 2 * diffuse, whole, mask, torch.tensor([False]), None)
     points = Points.of(faces, 1)
-    triangles = np.flatnonzero(predicted.seen[faces].all(1))
+    triangles = np.flatnonzero(predicted.visible[faces].all(1))
     logarithms, usable = fine_texture.ratios_of(predicted, seen, points, triangles, predicted.pixels)
     at = points.at(predicted.pixels, triangles)[:, 0]
     strong = bilinear((highlights > diffuse).any(-1)[0].numpy().astype(np.float32)[..., None], at)[:, 0] == 1
@@ -326,6 +353,14 @@ def test_the_mean_colour_of_a_print_stays():
     found, ink = np.exp(ratios.agreed(low_pass))[..., 0], printed_at(places)[..., 0]
     assert np.median(found[~ink]) / np.median(found[ink]) == pytest.approx(5, rel=0.02)
     assert found.mean() == pytest.approx(1, abs=0.01)
+
+
+def test_what_has_nothing_around_it_is_not_coarse():
+    """On triangles larger than its cubes, the low-pass finds nothing; all is fine then."""
+    ratios, *_ = halves(lambda places: 0.2 * np.sin(9 * places))
+    s, _ = FittedObject(np.zeros(3), 1.0).domain.sample(5)
+    values = ratios.agreed(LowPass(ratios.points, s, 0.005))
+    np.testing.assert_allclose(np.abs(values).max(), 0, atol=0.21)
 
 
 def test_a_grid_represents_what_points_show():

@@ -297,9 +297,10 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
 
 
 def at_level(scene: bytes, level: int) -> bytes:
-    """Return new content for the scene file of a fit, whose object has a mesh of this `level`. `scene`: the old one."""
+    """Return the scene file of a fit with another `level` of the object's mesh. `scene`: its content."""
     root = ElementTree.fromstring(scene)
-    next(e for e in root.iter("integer") if e.get("name") == "subdivisions").set("value", str(level))
+    shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
+    next(e for e in shape if e.get("name") == "subdivisions").set("value", str(level))
     return scene_bytes(root)
 
 

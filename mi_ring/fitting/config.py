@@ -81,7 +81,8 @@ class Common:
     Only needed if the BSDF of the scene is not cooktorrance. Example: --parameters base_color 0 1 roughness 0.05 1"""
     detail: Literal["none", "texture", "shape", "both"] = "both"
     """What the fit refines at the end, as fine as the pixels of the photographs. The networks alone are smooth.
-    texture: colour and gloss. shape: displacement of the surface. both: texture and shape.
+    texture: colour and gloss, and at the end a texture from the photographs at their own size.
+    shape: displacement of the surface. both: texture and shape.
     none: neither, which takes less time."""
     holdout: int = 0
     """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.

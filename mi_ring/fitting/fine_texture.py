@@ -1,9 +1,9 @@
 """A texture: colours as fine as the photographs, which may be larger than the fit has seen them.
 
 After a fit, surface, light and material are known. The ratio of a photograph to its prediction, without highlights, is
-what the fitted colours lack. Each point of the surface
-gets the mean ratio of the photographs that show it, as in the texture mapping of photogrammetry. Shading is divided
-out, so the colours stay free of light. Coarse differences are left out: they are errors of light or shape.
+what the fitted colours lack. Each point of the surface gets the mean ratio of the photographs that show it, as in the
+texture mapping of photogrammetry. Shading is divided out, so the colours stay free of light. Coarse differences are
+left out: they are errors of light or shape.
 """
 
 import math
@@ -21,12 +21,12 @@ from mi_ring.capture.decoding import read_photograph
 from mi_ring.capture.observation import Observation, observed
 from mi_ring.capture.reduction import reduced_image, windowed
 from mi_ring.fitting.surface_ratios import Points, Ratios, bilinear
-from mi_ring.geometry.meshes import area_vectors
-from mi_ring.nets.brdf_net import SPECULAR, albedo_of
+from mi_ring.geometry.hull import evenly_spaced
+from mi_ring.geometry.meshes import area_of
+from mi_ring.nets.brdf_net import albedo_of
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.rendering import prediction
-from mi_ring.rendering.bridge import to_drjit
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.shot import Shot, Window
@@ -35,7 +35,7 @@ from mi_ring.system.machine import pipelined
 from mi_ring.system.progress import progress
 
 WIDEST = 2048  #: to which photographs are reduced for the texture [px]
-PREDICTED = 1024  #: largest width of a prediction, which shows nothing finer than the fit [px]
+PREDICTED = 1024  #: largest width of a prediction, unless the fit is finer [px]
 CELL = 1.2  #: side of the cubes of the texture [px]
 COARSE = 8.0  #: differences that are coarser than this are left out [px of the fit]
 MOST_POINTS, MOST_PHOTOGRAPHS = 8_000_000, 80
@@ -45,11 +45,10 @@ SQUARE = np.ones((3, 3), np.uint8)  #: a pixel and its neighbours
 SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
 
 
-def used(given: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
+def chosen_photographs(given: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
     """Choose photographs for the texture: at most `MOST_PHOTOGRAPHS`, evenly among those of `fitted` with a file."""
     found = [int(k) for k in fitted if given.shots[k].files.filename]
-    count = min(len(found), MOST_PHOTOGRAPHS)
-    return [found[place * len(found) // count] for place in range(count)]
+    return [found[place] for place in evenly_spaced(len(found), MOST_PHOTOGRAPHS)]
 
 
 def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray) -> int:
@@ -57,13 +56,13 @@ def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray) -> int:
 
     `given`: the capture of the fit, which may be reduced. `fitted`: indices of its photographs that are fitted.
     """
-    shots = [given.shots[k] for k in used(given, fitted)]
+    shots = [given.shots[k] for k in chosen_photographs(given, fitted)]
     return min(WIDEST, max((shot.window.extent[0] if shot.window else shot.size[0] for shot in shots), default=0))
 
 
 def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray) -> float:
     """Estimate how long `sharpened` takes [s] on two cores. The arguments are those of `texture_width`."""
-    return sum(0.5 + 4e-8 * math.prod(given.shots[k].whole.size) for k in used(given, fitted))
+    return sum(0.5 + 4e-8 * math.prod(given.shots[k].whole.size) for k in chosen_photographs(given, fitted))
 
 
 def at_width(given: Shot, refined: Shot, width: int) -> tuple[Shot, Shot]:
@@ -89,13 +88,13 @@ def enlarged(before: Capture, k: int, own: Shot, shot: Shot) -> Observation:
     return observed(shot, image, mask, valid, 1)
 
 
-class Prediction(NamedTuple):
-    """What is predicted for a photograph, and where in it the vertices are."""
+class Expected(NamedTuple):
+    """What is expected in a photograph, and where in it the vertices are."""
 
     diffuse: np.ndarray  #: (h, w, 4) the picture without highlights, and which pixels are usable
     highlights: np.ndarray  #: (h, w, 3) the picture's highlights
-    pixels: np.ndarray  #: (V, 2) the vertices in it
-    seen: np.ndarray  #: (V,) which vertices are seen
+    pixels: np.ndarray  #: (V, 2) places of the vertices in the picture [px]
+    visible: np.ndarray  #: (V,) which vertices are seen
 
 
 class Predictor:
@@ -107,29 +106,30 @@ class Predictor:
     def __init__(self, surface: Surface, ring: FittedObject, refined: Capture) -> None:
         self.surface, self.ring, self.refined = surface, ring, refined
         self.s, self.faces = ring.domain.sample(ring.subdivisions)
-        vertices, material = ring(self.s.to(ring.center.device))
-        self.vertices = vertices.cpu().numpy()
+        with torch.no_grad():
+            self.vertices = ring.surface(self.s.to(ring.center.device)).cpu().numpy()
         self.normals = trimesh.Trimesh(self.vertices, self.faces, process=False).vertex_normals
         self.visibility = Visibility(self.vertices, self.faces, [])
-        self.highlights = {name: material[name] for name in SPECULAR if name in material}
 
-    def of(self, shot: Shot) -> Prediction:
+    def of(self, shot: Shot) -> Expected:
         """Predict a photograph. A pixel is usable if it and its neighbours show only the object, lit, no highlight."""
-        pictures = []
-        for factor in (0, 1):
-            self.surface.write_arrays({f"vertex_{k}": to_drjit(factor * v) for k, v in self.highlights.items()})
-            photographs = Photographs.of([shot], self.refined.room)
+        photographs = Photographs.of([shot], self.refined.room)
+
+        def drawn() -> tuple[np.ndarray, np.ndarray]:
             rgb, coverage = prediction.draw(self.surface, photographs, 1, shadows=self.refined.shadows,
                                             indirect=self.ring.indirect)  # fmt: skip
-            pictures.append(rgb[0].numpy())
-        diffuse, full = pictures
-        inside = eroded(coverage[0].numpy() > 0.99)
+            return rgb[0].numpy(), coverage[0].numpy()
+
+        full, coverage = drawn()
+        with prediction.without_gloss(self.surface):
+            diffuse, _ = drawn()
+        inside = eroded(coverage > 0.99)
         lit = diffuse[inside][diffuse[inside] > 0]
-        least = DARK * np.median(lit) if len(lit) else 1.0
+        least = DARK * np.median(lit) if len(lit) else 0.0
         usable = inside & ((diffuse > least) & (full - diffuse <= GLOSSY * full)).all(-1)
-        seen = self.visibility.seen_by(MaskedCamera(shot.camera, None), self.vertices, self.normals)
+        visible = self.visibility.seen_by(MaskedCamera(shot.camera, None), self.vertices, self.normals)
         pixels, _ = shot.camera.project(self.vertices)
-        return Prediction(np.dstack([diffuse, eroded(usable)]).astype(np.float32), full - diffuse, pixels, seen)
+        return Expected(np.dstack([diffuse, eroded(usable)]).astype(np.float32), full - diffuse, pixels, visible)
 
 
 def eroded(mask: np.ndarray) -> np.ndarray:
@@ -137,7 +137,7 @@ def eroded(mask: np.ndarray) -> np.ndarray:
     return cv2.erode(mask.astype(np.uint8), SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-def ratios_of(predicted: Prediction, seen: Observation, points: Points, triangles: np.ndarray, pixels: np.ndarray
+def ratios_of(expected: Expected, seen: Observation, points: Points, triangles: np.ndarray, pixels: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Compare a photograph with its prediction. Returns (logarithms of ratios (f, n, 3), which are usable (f, n)).
 
@@ -147,9 +147,13 @@ def ratios_of(predicted: Prediction, seen: Observation, points: Points, triangle
     """
     usable = seen.surely(torch.ones(1)).numpy()[0] & ~seen.clipped[0].numpy().any(-1)
     photograph = np.dstack([seen.rgb[0].numpy(), eroded(eroded(usable))]).astype(np.float32)
-    own, other = (points.at(at, triangles) for at in (pixels, predicted.pixels))
-    shown, diffuse, highlights = (bilinear(picture, at.reshape(-1, 2)).reshape(*at.shape[:2], -1) for picture, at in (
-        (photograph, own), (predicted.diffuse, other), (predicted.highlights, other)))  # fmt: skip
+
+    def at_points(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
+        at = points.at(places, triangles)
+        return bilinear(picture, at.reshape(-1, 2)).reshape(*at.shape[:2], picture.shape[-1])
+
+    shown, diffuse = at_points(photograph, pixels), at_points(expected.diffuse, expected.pixels)
+    highlights = at_points(expected.highlights, expected.pixels)
     ratio = (shown[..., :3] - highlights) / np.maximum(diffuse[..., :3], 1e-9)
     certain = np.minimum(shown[..., 3], diffuse[..., 3]) > 0.999
     return np.log(ratio.clip(math.exp(-LARGEST), math.exp(LARGEST))), certain
@@ -160,53 +164,48 @@ def sharpened(
     before: Capture, refined: Capture, surface: Surface, ring: FittedObject, fitted: Sequence[int] | np.ndarray,
     width: int,
 ) -> FittedObject:  # fmt: skip
-    """Return a copy of an object whose colours have a texture from the photographs, or the object itself.
+    """Return an object with the networks of `ring` and a texture from the photographs, or `ring` itself.
 
-    It is the object itself if the photographs show nothing that its colours lack, or if the material has no albedo.
-    `before`, `refined`: the capture before and after the calibration by the fit. `surface`:
-    shows the object `ring`, in the light of the fit. `fitted`: indices of the photographs to use. `width`: of the
-    photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
+    It is `ring` if there are no photographs with files, if they show nothing that its colours lack, or if the material
+    has no albedo. `before`, `refined`: the capture before and after the calibration by the fit. `surface`: shows the
+    object `ring`, in the light of the fit. `fitted`: indices of the photographs to use. `width`: of the photographs in
+    the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
-    widest = texture_width(before, fitted)
+    index, widest = chosen_photographs(before, fitted), texture_width(before, fitted)
     if not widest or not albedo_of(ring.brdf_net.bsdf_parameters):
         return ring
     predictor = Predictor(surface, ring, refined)
     vertices, normals, faces = predictor.vertices, predictor.normals, predictor.faces
-    given = used(before, fitted)
-    shots = {k: at_width(before.shots[k], refined.shots[k], widest) for k in given}
-    middle = ring.center.cpu().numpy()
+    shots = {k: at_width(before.shots[k], refined.shots[k], widest) for k in index}
+    middle, corners = ring.center.cpu().numpy(), torch.from_numpy(faces)
     resolution = float(np.median([  # pixels of a photograph for a length of 1 in scene units
         shot.camera.focal.mean() / np.linalg.norm(shot.camera.position - middle) for _, shot in shots.values()
     ]))  # fmt: skip
-    corners = torch.from_numpy(faces)
-    domain, area = (float(area_vectors(torch.as_tensor(at), corners).norm(dim=1).sum()) / 2
-                    for at in (predictor.s, vertices))  # fmt: skip
-    scale = resolution * math.sqrt(area / domain)  # pixels for a length of 1 on the domain
+    area = area_of(torch.from_numpy(vertices), corners)
+    scale = resolution * math.sqrt(area / area_of(predictor.s, corners))  # pixels for a length of 1 on the domain
     wanted = resolution * math.sqrt(area / len(faces))  # divisions of a triangle, for one point in each pixel
     divisions = max(1, min(math.ceil(wanted), math.isqrt(MOST_POINTS // len(faces))))
     ratios = Ratios(Points.of(faces, divisions))
 
-    def predicted(k: int) -> Prediction:
-        return predictor.of(at_width(before.shots[k], refined.shots[k], min(widest, PREDICTED))[1])
+    def predicted(k: int) -> Expected:
+        return predictor.of(at_width(before.shots[k], refined.shots[k], min(widest, max(width, PREDICTED)))[1])
 
-    def compare(k: int, found: Prediction) -> None:
+    def compare(k: int, expected: Expected) -> None:
         camera = shots[k][1].camera
         away = camera.position - vertices
         distance = np.linalg.norm(away, axis=1)
         weights = ((normals * away).sum(1) / distance).clip(0, 1) ** SLANT
         weights *= (camera.focal.mean() / resolution / distance) ** 2
-        triangles = np.flatnonzero(found.seen[faces].all(1))
-        seen = enlarged(before, k, *shots[k])
-        logarithms, usable = ratios_of(found, seen, ratios.points, triangles, camera.project(vertices)[0])
-        ratios.add(
-            given.index(k) % 2, triangles, logarithms, usable * ratios.points.at(weights[:, None], triangles)[..., 0]
-        )
+        triangles = np.flatnonzero(expected.visible[faces].all(1))
+        seen, (pixels, _) = enlarged(before, k, *shots[k]), camera.project(vertices)
+        logarithms, usable = ratios_of(expected, seen, ratios.points, triangles, pixels)
+        weight = usable * ratios.points.at(weights[:, None], triangles)[..., 0]
+        ratios.add(index.index(k) % 2, triangles, logarithms, weight)
 
-    for _ in progress(pipelined(predicted, compare, given), "fine texture", len(given)):
+    for _ in progress(pipelined(predicted, compare, index), "texture", len(index)):
         pass
-    grid = ratios.texture(
-        predictor.s, COARSE * max(1.0, widest / width) / scale, CELL * max(1.0, wanted / divisions) / scale
-    )
+    coarse, fine = COARSE * max(1.0, widest / width), CELL * max(1.0, wanted / divisions)  # in pixels
+    grid = ratios.texture(predictor.s, coarse / scale, fine / scale)
     if grid is None:
         return ring
     return FittedObject(

@@ -28,7 +28,8 @@ def result_of(
 ) -> FitResult:  # fmt: skip
     """Collect the results of a fit, from which files are written later. Writes no files, but evaluates the surface.
 
-    At the end of a fit with details, the material first gets a texture.
+    At the end of a fit with details of colour, the material first gets a texture from the photographs. It gets none if
+    held-out photographs have shown that details are wrong.
 
     `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: share of the
     observed light that recent predictions do not explain.
@@ -39,7 +40,8 @@ def result_of(
         masked = replace(problem, capture=capture)
         return summary(problem, model, refined, covariance(masked, model, renderer, ring.subdivisions))
 
-    if course.iteration == schedule.iterations and schedule.stages[-1].detail and problem.config.detail != "shape":
+    detailed = schedule.stages[-1].detail and "detail" not in course.validation.get("put_back", [])
+    if course.iteration == schedule.iterations and detailed and problem.config.detail != "shape":
         try:
             shown = renderer.show(model, ring.subdivisions)
             ring = sharpened(capture, refined, shown, ring, problem.fitted, max(problem.config.widths))

@@ -122,12 +122,12 @@ class Keeper:
             raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(result, fitted_scene)}") from error
 
     def warn_of_changes(self) -> None:
-        """Print which input files have changed since the fit began. The results are made from both contents then."""
+        """Print which input files have changed since the fit began. Its results then come from both contents."""
         with contextlib.suppress(OSError):  # a file that has gone is reported where it is needed
             now = digests(self.fit.problem.given, self.fit.problem.config)
             if changed := [name for name, content in now.items() if content != self.files.get(name)]:
-                print(f"{', '.join(sorted(changed))}: changed while the fit ran; texture and report are not those of "
-                      "the photographs that it has seen; fit again")  # fmt: skip
+                print(f"{', '.join(sorted(changed))}: changed while the fit ran. Texture and report show the new "
+                      "files, surface and material the old ones; fit again")  # fmt: skip
 
     def rescue(self, result: FitResult, fitted_scene: bytes) -> str:
         """Write as much as possible of checkpoint and results to a new temporary folder.

@@ -26,7 +26,10 @@ class Points(NamedTuple):
         return cls(faces, np.column_stack([1 - above.sum(1), above]).astype(np.float32))
 
     def at(self, values: np.ndarray, triangles: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Interpolate values (V, C) of the vertices in some triangles: (triangles, n, C) float32."""
+        """Interpolate values (V, C) of the vertices at the points of triangles: (f, n, C) float32.
+
+        `triangles` (f,): indices; by default all.
+        """
         corners = values.astype(np.float32)[self.faces[triangles]]
         return sum(self.shares[:, k, None] * corners[:, None, k] for k in range(3))
 
@@ -52,10 +55,14 @@ class LowPass:
         grid = Grid.around(torch.cat([s, centres]), cell, 1, 1)
         self.gather, self.spread = (grid.weights(at)[0] for at in (centres, s))
 
-    def of(self, sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return means (V, C) at the vertices. `sums` (F, C), `weights` (F,): of weighted values of the triangles."""
+    def of(self, sums: np.ndarray, weights: np.ndarray, otherwise: float = 0.0) -> np.ndarray:
+        """Return means (V, C) at the vertices. `sums` (F, C), `weights` (F,): of weighted values of the triangles.
+
+        `otherwise`: the value of a vertex that has nothing around it.
+        """
         both = self.spread @ (self.gather.T @ np.column_stack([sums, weights]))
-        return both[:, :-1] / np.maximum(both[:, -1:], 1e-12)
+        sums, total = both[:, :-1], both[:, -1:]
+        return np.where(total > 0, sums / np.where(total > 0, total, 1), otherwise)
 
 
 class Ratios:
@@ -75,8 +82,8 @@ class Ratios:
     def texture(self, s: torch.Tensor, coarse: float, fine: float) -> Grid | None:
         """Return what both halves show as a grid with the channels red, green and blue; None if this is nothing.
 
-        `s` (V, 3): vertices of the triangles, on the domain. `coarse`: what is larger is left out. `fine`: side of the
-        cubes of the grid. Afterwards, the ratios are gone.
+        `s` (V, 3): vertices of the triangles, on the domain. `coarse`: longer waves are left out. `fine`: side of the
+        cubes of the grid. Both are lengths on the domain. Afterwards, the ratios are gone.
         """
         values, weights = self.agreed(LowPass(self.points, s, coarse)), self.weights.sum(0)
         del self.sums, self.weights  # before more memory is needed
@@ -104,8 +111,8 @@ class Ratios:
         for own, weights in zip(means, self.weights):
             own /= np.maximum(weights, 1e-9)[..., None]
             # Of the ratios themselves: the fitted colour of a print is the mean of ink and paper, not of logarithms.
-            coarse = low_pass.of((np.exp(own) * weights[..., None]).sum(1), weights.sum(1))
-            own -= self.points.at(np.log(np.maximum(coarse, 1e-3)))
+            coarse = low_pass.of((np.exp(own) * weights[..., None]).sum(1), weights.sum(1), otherwise=1.0)
+            own -= self.points.at(np.log(coarse))
         both = np.where((self.weights > 0).all(0), total, 0)
         common = (both * means.prod(0).mean(-1)).sum(1)
         different = (both * np.square(means[0] - means[1]).mean(-1) / 4).sum(1)

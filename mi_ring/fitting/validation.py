@@ -15,7 +15,6 @@ from mi_ring.capture.decoding import recorded
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
-from mi_ring.objects.detail import Remembered
 from mi_ring.rendering import prediction
 
 COMPARED_WIDTH, SPP, MOST = 256, 4, 16  #: largest width [px], samples per pixel, and number of the pictures compared
@@ -70,9 +69,8 @@ def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> 
         without = now()
         if without <= found:
             found, reset = without, ["detail"]
-            for part in torch.nn.ModuleList(detailed).modules():
-                if isinstance(part, Remembered):
-                    part.release()
+            for network in detailed:
+                network.base.release()  # type: ignore[union-attr, operator]  # torch's types of modules
         else:
             model.ring.shape_net, model.ring.brdf_net = detailed
     if calibration is None:

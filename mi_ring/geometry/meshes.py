@@ -52,6 +52,11 @@ def genus(mesh: trimesh.Trimesh) -> int:
     return mesh.body_count - mesh.euler_number // 2
 
 
+def area_of(points: Tensor, faces: Tensor) -> float:
+    """Return the area of a mesh. `points` (V, 3): vertices. `faces` (F, 3): triangles."""
+    return float(area_vectors(points, faces).norm(dim=1).sum()) / 2
+
+
 def area_vectors(points: Tensor, faces: Tensor) -> Tensor:
     """Compute normals of triangles, each as long as twice the triangle's area: (F, 3).
 

@@ -24,7 +24,8 @@ class Parameter(NamedTuple):
 
 
 ALBEDO = "diffuse", "reflectance", "diffuse_reflectance", "base_color"  #: Mitsuba's names of the colour without gloss
-SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha")  #: and of the gloss
+#: Mitsuba's names of the strength of highlights, and of their width
+SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha")
 
 #: The paper's five numbers.
 COOK_TORRANCE = (
@@ -88,9 +89,9 @@ class MaterialNet(nn.Module):
         return result
 
     def texture(self, s: Tensor) -> Tensor | None:
-        """Compute factors (..., 3) of the albedo at domain points (..., 3), if there is a texture.
+        """Compute factors (..., 3) of the albedo at domain points (..., 3). Returns None if there is no texture.
 
-        A texture is too fine for the vertices of a mesh. So a call leaves it out.
+        `forward` leaves it out, because it is too fine for the vertices of a mesh.
         """
         return None
 

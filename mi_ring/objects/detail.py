@@ -121,7 +121,7 @@ class Grid(nn.Module):
         if len(s) > PART:
             return torch.cat([self(part, values) for part in s.split(PART)])
         values = list(self.values) if values is None else values
-        if moves(s):  # the sparse matrices have no gradient with respect to the points
+        if wants_gradient(s):  # the sparse matrices have no gradient with respect to the points
             around = [self.octave_weights(s.cpu(), k) for k in range(len(values))]
             parts = [(weight[..., None].to(own) * own[node]).sum(1) for (weight, node), own in zip(around, values)]
         else:
@@ -143,8 +143,8 @@ class _Product(torch.autograd.Function):
         return torch.from_numpy(ctx.matrix.T @ gradient.numpy(force=True)).to(gradient.device), None
 
 
-def moves(s: Tensor) -> bool:
-    """Return True if somebody wants the gradient with respect to the points `s`. A fit does not."""
+def wants_gradient(s: Tensor) -> bool:
+    """Return True if a gradient with respect to the points `s` is wanted. In a fit it is not."""
     return s.requires_grad and torch.is_grad_enabled()
 
 
@@ -180,7 +180,7 @@ class Remembered(nn.Module):
 
         If they and the network are those of the last call, this is the result of the last call.
         """
-        if moves(s):
+        if wants_gradient(s):
             with torch.autocast(s.device.type, enabled=False):
                 return getattr(self.network, self.method)(s, *more)
         last, asked = self.last, (stamp(s, *self.network.parameters(), *self.network.buffers()), more)

@@ -23,7 +23,10 @@ FORMAT = 4  #: version of the file format
 MAX_LEVEL, MAX_STEPS = 8, 10_000  #: of the mesh; Euler steps
 ADVICE = "give the results folder of a fit, or its ring.pt"
 DETAILS = "detailed-flow", "detailed-material", "sharpened-material"  #: networks that add a grid to another network
-TEXTURED = "sharpened-material", "detailed-material"  #: the only one of these that may be in another
+TEXTURED = (
+    "sharpened-material",
+    "detailed-material",
+)  #: outer and inner network: the only pair of these that may be nested
 
 
 def ring_state(ring: FittedObject, config: dict | None = None) -> dict:
@@ -62,7 +65,7 @@ def ring_of(state: dict) -> FittedObject:
         refuse("solver", arguments.pop("solver", "euler"), "euler")
         shape_net = {**shape_net, "arguments": arguments}
     for tensor in [*state["networks"].values(), *(state["domain"] or {}).values()]:
-        if isinstance(tensor, torch.Tensor):  # not a few numbers that stand for many, as `expand` makes them
+        if isinstance(tensor, torch.Tensor):  # `expand` makes a few numbers look like many, which would be allocated
             require(tensor.nbytes <= tensor.untyped_storage().nbytes(), "a tensor repeats its numbers")
     domain = state["domain"] and Domain(state["domain"]["points"], state["domain"]["faces"])
     for name in ("shape_net", "brdf_net"):

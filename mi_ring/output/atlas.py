@@ -6,6 +6,7 @@ The networks are functions on the domain, which is the start surface of the fit 
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import scipy.ndimage
@@ -155,6 +156,7 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
         y, x = np.meshgrid(rows, np.arange(resolution), indexing="ij")
         centre = mi.Point3f(*(to_flat(mi.Float, (k + 0.5) / resolution) for k in (x, y)), 1)
         hit = scene.ray_intersect_preliminary(mi.Ray3f(centre, mi.Vector3f(0, 0, -1)))
+        dr.eval(hit)
         shown = np.array(hit.is_valid())
         inside[rows] = shown.reshape(x.shape)
         corners = faces[np.array(hit.prim_index)[shown]]
@@ -169,9 +171,9 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
 
 
 def in_frame(m: np.ndarray, t: np.ndarray, b: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Return the vectors (N, 3) that a renderer turns into the directions `m` (N, 3), as unit vectors.
+    """Return unit vectors (x, y, z) (N, 3) in a tangent frame: x t + y b + z n has the direction of `m` (N, 3).
 
-    It computes x t + y b + z n, where `t`, `b`, `n` (N, 3) are tangent, bitangent and normal of the mesh, interpolated.
+    `t`, `b`, `n` (N, 3): the interpolated tangent, bitangent and normal of the mesh, as a renderer has them.
     """
     n, t, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (n, t, b))
     local = np.stack([(np.cross(p, q) * m).sum(1) for p, q in ((b, n), (n, t), (t, b))], 1)

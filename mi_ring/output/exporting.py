@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import trimesh
+import torch
 
 from mi_ring.errors import InputError
+from mi_ring.geometry.meshes import area_of
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.output import gltf
@@ -22,7 +23,7 @@ from mi_ring.system.files import all_or_none, require_place, write_file
 KINDS = ".ply", ".obj", ".glb", ".xml"
 GLB_LEVEL = 5  #: of its mesh; finer detail is in the normal map
 MAX_LEVEL, MAX_PLY_LEVEL = 8, 10  #: finest level of a mesh with textures, and of one without
-RESOLUTIONS = 2048, 4096  #: usual width of textures [px]; that of a material with a texture which needs it
+RESOLUTION, FINE_RESOLUTION = 2048, 4096  #: width of textures [px]: usual; for a material whose texture needs more
 AREA_LEVEL = 4  #: of the mesh that tells the area of a domain
 FILLED = 0.6  #: share of the texels that show a part of the surface
 
@@ -74,10 +75,11 @@ def export(
 
 def resolution_of(ring: FittedObject) -> int:
     """Choose the width of the textures of an object [px]: 2048, or 4096 if its own texture is finer than that."""
-    area = trimesh.Trimesh(*ring.domain.sample(AREA_LEVEL), process=False).area
+    s, faces = ring.domain.sample(AREA_LEVEL)
+    area = area_of(s, torch.from_numpy(faces))
     textures = [part.grid for part in ring.brdf_net.modules() if isinstance(part, SharpenedMaterial)]
-    finer = any(area / grid.cells[-1] ** 2 > FILLED * RESOLUTIONS[0] ** 2 for grid in textures)
-    return RESOLUTIONS[finer]
+    finer = any(area / grid.cells[-1] ** 2 > FILLED * RESOLUTION**2 for grid in textures)
+    return FINE_RESOLUTION if finer else RESOLUTION
 
 
 def require_exportable(

@@ -21,7 +21,7 @@ class FitResult:
     """
 
     ring: FittedObject
-    surface: Surface  #: of the ring, to draw it
+    surface: Surface  #: to draw the ring; see `drawn`
     given: Capture  #: the input of the fit
     before: Capture  #: the input with the fit's lights and masks, and the calibration before the fit
     capture: Capture  #: the same with the refined calibration

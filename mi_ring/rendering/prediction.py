@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from mi_ring.rendering.surface import Surface
 from mi_ring.rendering.views import Views
 from mi_ring.scene.plain_mesh import POSITIONS
 
-TEXELS = 4  #: rays for the texture in a pixel
+TEXTURE_RAYS = 4  #: in a pixel
 NO_AREA = 1e-6  #: twice a triangle's area / (longest side)² below which float32 gives no normal
 
 
@@ -117,22 +118,23 @@ def draw(
         if harmonics and occlusion:
             rgb = (rgb + added.occlusion(torch.from_numpy(photographs.room).to(rgb))).clamp(min=0)
     if surface.texture:
-        with without_gloss(surface):
-            matte, _ = draw(surface, photographs, spp, seed, shadows, indirect, paths, occlusion)
+        with without_gloss(surface) as is_other:
+            how = spp, seed, shadows, indirect, paths, occlusion
+            matte = draw(surface, photographs, *how)[0] if is_other else rgb.cpu()
         rgb = rgb.cpu() + matte * (texture_factors(surface, photographs, seed) - 1)
     return rgb.cpu(), coverage.cpu()
 
 
 @contextmanager
-def without_gloss(surface: Surface) -> Iterator[None]:
-    """Show the surface without highlights and without its texture."""
+def without_gloss(surface: Surface) -> Iterator[bool]:
+    """Show the surface without highlights and without its texture. Yields False if it has no highlights."""
     names = [f"vertex_{name}" for name in SPECULAR if surface.prefix + f"vertex_{name}" in surface.params]
     gloss = {name: mi.Float(surface.params[surface.prefix + name]) for name in names}  # not references
     texture = surface.texture
     surface.texture = None
     surface.write_arrays({name: 0 * value for name, value in gloss.items()})
     try:
-        yield
+        yield bool(gloss)
     finally:
         surface.texture = texture
         surface.write_arrays(gloss)
@@ -141,19 +143,20 @@ def without_gloss(surface: Surface) -> Iterator[None]:
 @torch.no_grad()
 def texture_factors(surface: Surface, photographs: Photographs, seed: int = 0) -> Tensor:
     """Compute the factors (N, H, W, 3) by which the texture changes the matte light of pixels."""
-    own, parts = photographs.in_units(surface.unit), []
-    for pixels in photographs.chunks(TEXELS):
-        hit = surface.scene.ray_intersect_preliminary(pixel_rays(own, TEXELS, seed, pixels)[0])
+    own, s, parts = photographs.in_units(surface.unit), surface.s.numpy(force=True), []
+    for pixels in photographs.chunks(TEXTURE_RAYS):
+        hit = surface.scene.ray_intersect_preliminary(pixel_rays(own, TEXTURE_RAYS, seed, pixels)[0])
+        dr.eval(hit)
         shown = np.array(hit.is_valid() & (hit.shape == mi.ShapePtr(surface.shape)))
-        u, v = np.array(hit.prim_uv)[:, shown]
-        corners = surface.faces[np.array(hit.prim_index)[shown]]
-        s = sum(
-            share[:, None] * surface.s.numpy(force=True)[corners[:, k]] for k, share in enumerate((1 - u - v, u, v))
-        )
-        factors = torch.ones(len(shown), 3)
-        if len(s):
-            factors[torch.from_numpy(shown)] = surface.texture(torch.from_numpy(s)).cpu()
-        parts.append(factors.reshape(-1, TEXELS, 3).mean(1))
+        u, v = np.array(hit.prim_uv)[:, shown, None]
+        a, b, c = surface.faces[np.array(hit.prim_index)[shown]].T
+        factors = torch.zeros(len(shown), 3)
+        if shown.any():
+            points = torch.from_numpy((1 - u - v) * s[a] + u * s[b] + v * s[c])
+            factors[torch.from_numpy(shown)] = surface.texture(points)
+        hits = torch.from_numpy(shown).reshape(-1, TEXTURE_RAYS).sum(1, keepdim=True)
+        mean = factors.reshape(-1, TEXTURE_RAYS, 3).sum(1) / hits.clamp(min=1)
+        parts.append(torch.where(hits > 0, mean, 1.0))
     return torch.cat(parts).reshape(*photographs.shape, 3)
 
 
@@ -177,5 +180,6 @@ def maps(
         result[p.name] = channels[..., first : first + 3] if p.channels == 3 else channels[..., first]
         first += p.channels
     if surface.texture and (colour := albedo_of(parameters)):
-        result[colour.name] = result[colour.name] * texture_factors(surface, photographs).numpy()
+        factors = texture_factors(surface, photographs).numpy()
+        result[colour.name] = (result[colour.name] * factors).clip(colour.low, colour.high)
     return result

@@ -50,7 +50,8 @@ class Surface:
         self.edges: Edges | None = None  #: those of the last picture with gradients of moving edges
         self.written = 0  #: number of times that vertices were written
         self.s = torch.zeros(0, 3)  #: (V, 3) points of the domain that `show` has written
-        self.texture: Callable[[Tensor], Tensor] | None = None  #: of the object that `show` has written
+        #: of the object that `show` has written: factors (n, 3) at points (n, 3) of the domain, on the CPU
+        self.texture: Callable[[Tensor], Tensor] | None = None
 
     def set_faces(self, faces: np.ndarray) -> None:
         """Set other triangles (F, 3). Vertices and attributes must be written again before the next rendering."""
@@ -81,6 +82,7 @@ class Surface:
         `vertices` (V, 3) [scene units]. `attributes`: (V, 3) or (V,) by name. Raises ValueError if V is not the number
         of vertices that the triangles need, or if an attribute has another size.
         """
+        self.texture = None  # it is of another object
         self.write_arrays({name: to_drjit(t) for name, t in self.parameters(vertices, attributes).items()})
 
     def write_arrays(self, arrays: dict[str, mi.Float]) -> None:
@@ -117,10 +119,9 @@ class Surface:
         with torch.no_grad():
             self.set_faces(faces)
             self.write(*ring(s.to(ring.center.device), time))
-            self.s = s
-            self.texture = (
-                None if ring.brdf_net.texture(s[:1].to(ring.center.device)) is None else ring.brdf_net.texture
-            )
+            device, texture = ring.center.device, ring.brdf_net.texture
+            if texture(s[:1].to(device)) is not None:
+                self.s, self.texture = s, lambda points: texture(points.to(device)).cpu()
 
 
 def unit_for(radius: float) -> float:

@@ -212,7 +212,7 @@ def all_or_none(path: Path) -> Iterator[Path]:
     """A context manager for several files that belong together. Yields the path to write instead of `path`.
 
     The other files are written beside it. At the end, all move to the folder of `path`, `path` itself last. After an
-    error, all that was there before stays as it was. Raises InputError if something cannot be written.
+    error before that, all that was there stays as it was. Raises InputError if something cannot be written.
     """
     with writing(path), tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
         folder = Path(name)
@@ -220,5 +220,8 @@ def all_or_none(path: Path) -> Iterator[Path]:
             yield folder / path.name
         except InputError as error:
             raise InputError(str(error).replace(str(folder), str(path.parent))) from error
-        for file in sorted(folder.iterdir(), key=lambda file: file.name == path.name):
+        made = sorted(folder.iterdir(), key=lambda file: (file.name == path.name, file.name))
+        if there := next((path.with_name(file.name) for file in made if path.with_name(file.name).is_dir()), None):
+            raise InputError(f"{there}: is a folder; choose another name for {path.name}")
+        for file in made:
             os.replace(file, path.with_name(file.name))
