@@ -467,6 +467,13 @@ def test_a_full_disk_leaves_no_part_of_an_export(ring, run, tmp_path, monkeypatc
     assert (tmp_path / "f_object.ply").read_text() == "as before"
 
 
+def test_a_folder_in_the_place_of_a_texture_is_named_before_anything_moves(run, tmp_path):
+    (tmp_path / "f_normal.png").mkdir()
+    with pytest.raises(InputError, match="f_normal.png: is a folder; choose another name for f.obj"):
+        export.main([str(run), str(tmp_path / "f.obj"), "--subdivisions", "1", "--resolution", "64"])
+    assert [file.name for file in tmp_path.iterdir()] == ["f_normal.png"]
+
+
 def test_ply_at_time_0_is_the_domain(run, tmp_path):
     export.main([str(run), str(tmp_path / "start.ply"), "--time", "0", "--subdivisions", "2"])
     mesh = trimesh.load(tmp_path / "start.ply")
