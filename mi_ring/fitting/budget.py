@@ -30,6 +30,7 @@ def measure(fit: Fit, stages: Iterable[Stage], interrupted: Callable[[], int] = 
     trial.ring.domain = fit.ring.domain  # it caches its samplings for the fit, too
     state, costs = trial.sampler.state(), {}
     for stage in {(stage.level, stage.width): stage for stage in stages if not stage.detail}.values():
+        release_memory()  # reading photographs has left some, and so does each stage
         # A stage that shapes the surface: one with a fixed surface takes less time.
         last = trial.schedule.iterations
         trial.schedule = replace(trial.schedule, stages=(stage._replace(first=0, last=last, settles=False),))
