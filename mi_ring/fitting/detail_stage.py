@@ -7,7 +7,8 @@ import torch
 import trimesh
 
 from mi_ring.fitting.problem import Problem
-from mi_ring.geometry.meshes import area_vectors
+from mi_ring.geometry.camera import pixels_per_unit
+from mi_ring.geometry.meshes import area_of, area_vectors
 from mi_ring.nets.registry import is_registered
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
 from mi_ring.objects.fitted_object import FittedObject
@@ -18,18 +19,14 @@ OCTAVES = 4  #: of the grids: the coarsest cubes are as large as what the networ
 STEEPEST, HALVINGS = 0.2, 8  #: least cosine between a triangle with and without details; see `unfold`
 
 
-def pixels_per_unit(problem: Problem, center: np.ndarray, radius: float) -> float:
+def fit_resolution(problem: Problem, center: np.ndarray, radius: float) -> float:
     """Compute how many pixels of a photograph show a length of 1 in the normalised frame. Returns the median.
 
     `center` (3,), `radius`: normalising sphere [scene units]. The photographs are as wide as in the last stage.
     """
+    cameras = [problem.capture.shots[k].camera for k in problem.fitted]
     width = max(problem.config.widths)
-    found = []
-    for k in problem.fitted:
-        shot = problem.capture.shots[k]
-        distance = float(np.linalg.norm(shot.camera.position - center))
-        found.append(shot.camera.focal.mean() / -(-shot.size[0] // width) * radius / distance)
-    return float(np.median(found))
+    return radius * pixels_per_unit([camera.shrunk(-(-camera.size[0] // width)) for camera in cameras], center)
 
 
 def detail_levels(ring: FittedObject, resolution: float) -> list[int]:
@@ -54,11 +51,11 @@ def add_detail(ring: FittedObject, level: int, resolution: float) -> None:
     """
     s, faces = ring.domain.sample(level)
     s, corners = s.to(ring.center.device), torch.from_numpy(faces).to(ring.center.device)
-    domain, surface = area_vectors(s, corners), area_vectors(ring.shape_net(s), corners)
-    stretch = math.sqrt(surface.norm(dim=1).sum() / domain.norm(dim=1).sum())  # of lengths on the domain, by the flow
+    points = ring.shape_net(s)
+    stretch = math.sqrt(area_of(points, corners) / area_of(s, corners))  # of lengths on the domain, by the flow
     around = torch.cat([s, s[corners].mean(1)]).cpu()
     grid = Grid.around(around, CELL / stretch / resolution, OCTAVES, channels=1)
-    normals = torch.zeros_like(s).index_add(0, corners.ravel(), surface.repeat_interleave(3, 0))
+    normals = torch.zeros_like(s).index_add(0, corners.ravel(), area_vectors(points, corners).repeat_interleave(3, 0))
     ring.brdf_net = DetailedMaterial.of(ring.brdf_net, grid.like(ring.brdf_net.outputs)).to(s.device)
     ring.shape_net = DetailedFlow.of(ring.shape_net, grid, s, normals).to(s.device)
     share_weights(ring)

@@ -21,6 +21,7 @@ from mi_ring.capture.decoding import read_photograph
 from mi_ring.capture.observation import Observation, observed
 from mi_ring.capture.reduction import reduced_image, windowed
 from mi_ring.fitting.surface_ratios import Points, Ratios, bilinear
+from mi_ring.geometry.camera import pixels_per_unit
 from mi_ring.geometry.hull import evenly_spaced
 from mi_ring.geometry.meshes import area_of
 from mi_ring.nets.brdf_net import albedo_of
@@ -177,10 +178,8 @@ def sharpened(
     predictor = Predictor(surface, ring, refined)
     vertices, normals, faces = predictor.vertices, predictor.normals, predictor.faces
     shots = {k: at_width(before.shots[k], refined.shots[k], widest) for k in index}
-    middle, corners = ring.center.cpu().numpy(), torch.from_numpy(faces)
-    resolution = float(np.median([  # pixels of a photograph for a length of 1 in scene units
-        shot.camera.focal.mean() / np.linalg.norm(shot.camera.position - middle) for _, shot in shots.values()
-    ]))  # fmt: skip
+    resolution = pixels_per_unit([shot.camera for _, shot in shots.values()], ring.center.cpu().numpy())
+    corners = torch.from_numpy(faces)
     area = area_of(torch.from_numpy(vertices), corners)
     scale = resolution * math.sqrt(area / area_of(predictor.s, corners))  # pixels for a length of 1 on the domain
     wanted = resolution * math.sqrt(area / len(faces))  # divisions of a triangle, for one point in each pixel

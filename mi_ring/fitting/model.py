@@ -7,7 +7,7 @@ from torch import nn
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Capture
-from mi_ring.fitting.detail_stage import add_detail, detail_levels, pixels_per_unit, share_weights
+from mi_ring.fitting.detail_stage import add_detail, detail_levels, fit_resolution, share_weights
 from mi_ring.fitting.lighting import room_frames
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import Refinement
@@ -37,7 +37,7 @@ class Model(nn.Module):
             self.calibration = Calibration(capture, refined, rig, room_frames(capture, lighting))
             self.calibration.room.to(problem.device)
         self.starts_near = not isinstance(ring.domain, Sphere)  #: from a hull or a mesh
-        self.resolution = pixels_per_unit(problem, center, float(ring.radius))  #: of the photographs
+        self.resolution = fit_resolution(problem, center, float(ring.radius))  #: of the photographs
         self.detail_levels = detail_levels(ring, self.resolution)  #: of the meshes for details, from coarse to fine
         share_weights(ring)
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]

@@ -1,5 +1,6 @@
 """Cameras as numpy arrays, with or without lens distortion, and projections to their pictures."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,11 @@ from mi_ring.errors import InputError, require_numbers
 MIN_DISTORTION, MAX_DISTORTION = 0.9 * -4 / 27, 10.0
 NEWTON_STEPS = 6
 FARTHEST = 50  #: sizes of the picture from which a principal point may be
+
+
+def pixels_per_unit(cameras: Sequence["Camera"], point: np.ndarray) -> float:
+    """Return how many pixels show a length of 1 [scene units] at a `point` (3,): the median of the cameras."""
+    return float(np.median([camera.focal.mean() / np.linalg.norm(camera.position - point) for camera in cameras]))
 
 
 class NoParallax(InputError):

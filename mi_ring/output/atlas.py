@@ -6,7 +6,6 @@ The networks are functions on the domain, which is the start surface of the fit 
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import scipy.ndimage
@@ -156,7 +155,6 @@ def rasterise(ring: FittedObject, atlas: Atlas, resolution: int, time: float = 1
         y, x = np.meshgrid(rows, np.arange(resolution), indexing="ij")
         centre = mi.Point3f(*(to_flat(mi.Float, (k + 0.5) / resolution) for k in (x, y)), 1)
         hit = scene.ray_intersect_preliminary(mi.Ray3f(centre, mi.Vector3f(0, 0, -1)))
-        dr.eval(hit)
         shown = np.array(hit.is_valid())
         inside[rows] = shown.reshape(x.shape)
         corners = faces[np.array(hit.prim_index)[shown]]
