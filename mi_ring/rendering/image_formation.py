@@ -52,3 +52,15 @@ def render_maps(scene, photographs, attributes, pixels=None):
                 values = [dr.select(here, new, old) for new, old in zip(found, values)]
         maps += values
     return maps
+
+
+def find_triangles(scene, shape, photographs, spp, seed, pixels):
+    """Trace the rays of `render_photographs` to the mesh `shape`. Returns arrays with an entry for each ray.
+
+    These are: whether the ray meets the mesh first, the index of its triangle, and two barycentric coordinates. `spp`:
+    rays per pixel. `pixels`: range of pixels (first, last + 1), numbered through all photographs.
+    """
+    hit = scene.ray_intersect_preliminary(pixel_rays(photographs, spp, seed, pixels)[0])
+    found = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)), hit.prim_index, *hit.prim_uv
+    dr.eval(found)  # together: else each array traces the rays anew
+    return found

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import torch
@@ -14,8 +13,8 @@ from mi_ring.nets.brdf_net import COOK_TORRANCE, SPECULAR, Parameter, albedo_of
 from mi_ring.rendering.bridge import differentiable, evaluated, to_drjit
 from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.global_illumination import GlobalIllumination
-from mi_ring.rendering.image_formation import render_maps, render_photographs
-from mi_ring.rendering.photographs import Photographs, pixel_rays
+from mi_ring.rendering.image_formation import find_triangles, render_maps, render_photographs
+from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.rendering.views import Views
 from mi_ring.scene.plain_mesh import POSITIONS
@@ -145,18 +144,17 @@ def texture_factors(surface: Surface, photographs: Photographs, seed: int = 0) -
     """Compute the factors (N, H, W, 3) by which the texture changes the matte light of pixels."""
     own, s, parts = photographs.in_units(surface.unit), surface.s.numpy(force=True), []
     for pixels in photographs.chunks(TEXTURE_RAYS):
-        hit = surface.scene.ray_intersect_preliminary(pixel_rays(own, TEXTURE_RAYS, seed, pixels)[0])
-        dr.eval(hit)
-        shown = np.array(hit.is_valid() & (hit.shape == mi.ShapePtr(surface.shape)))
-        u, v = np.array(hit.prim_uv)[:, shown, None]
-        a, b, c = surface.faces[np.array(hit.prim_index)[shown]].T
+        hits = find_triangles(surface.scene, surface.shape, own, TEXTURE_RAYS, seed, pixels)
+        shown, triangle, *place = map(np.array, hits)
+        u, v = (share[shown, None] for share in place)
+        a, b, c = surface.faces[triangle[shown]].T
         factors = torch.zeros(len(shown), 3)
         if shown.any():
             points = torch.from_numpy((1 - u - v) * s[a] + u * s[b] + v * s[c])
             factors[torch.from_numpy(shown)] = surface.texture(points)
-        hits = torch.from_numpy(shown).reshape(-1, TEXTURE_RAYS).sum(1, keepdim=True)
-        mean = factors.reshape(-1, TEXTURE_RAYS, 3).sum(1) / hits.clamp(min=1)
-        parts.append(torch.where(hits > 0, mean, 1.0))
+        number = torch.from_numpy(shown).reshape(-1, TEXTURE_RAYS).sum(1, keepdim=True)
+        mean = factors.reshape(-1, TEXTURE_RAYS, 3).sum(1) / number.clamp(min=1)
+        parts.append(torch.where(number > 0, mean, 1.0))
     return torch.cat(parts).reshape(*photographs.shape, 3)
 
 
