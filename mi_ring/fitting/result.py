@@ -18,6 +18,7 @@ from mi_ring.fitting.schedule import Schedule
 from mi_ring.fitting.summary import summary
 from mi_ring.output.fit_result import FitResult
 from mi_ring.scene.assembly import lamp_lights
+from mi_ring.system.machine import release_memory
 
 SAME = 1e-5  #: relative difference below which room light is nothing but the scene's own environment
 
@@ -42,6 +43,7 @@ def result_of(
 
     detailed = schedule.stages[-1].detail and "detail" not in course.validation.get("put_back", [])
     if course.iteration == schedule.iterations and detailed and problem.config.detail != "shape":
+        release_memory()  # of the last stage
         try:
             shown = renderer.show(model, ring.subdivisions)
             ring = sharpened(capture, refined, shown, ring, problem.fitted, max(problem.config.widths))
