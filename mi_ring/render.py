@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> None:
     else:
         for picture, view in zip(pictures, views):  # `pictures` first, so that its progress bar ends
             write_picture(recorded(picture, view.shot), config.out / view.name)
-        print(f"{len(views)} pictures in {config.out}/")
+        print(f"{len(views)} picture{'s' * (len(views) != 1)} in {config.out}/")
     run = config.run if config.run.is_dir() else config.run.parent
     same_light = config.scene.resolve().parent == run.resolve() and not (config.material or config.envmap)
     if (unknown := ambiguity_of(config.material or config.run)) and not same_light:

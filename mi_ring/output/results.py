@@ -28,7 +28,7 @@ from mi_ring.system.files import locked, read_json, relative_to, write_file, wri
 
 PRECIOUS = "ring.pt", "checkpoint.pt", "checkpoint.before.pt"  #: a folder with one of these is moved aside
 OWN_SCENE = Path("capture", "scene.xml")  #: in the folder of a fit: the scene file of a capture from arrays
-VIEWED, TEXELS = 5, 1024  #: finest level of the object in the report's viewer, and width of its textures [px]
+VIEWED, TEXELS = 6, 1024  #: finest level of the object in the report's viewer, and width of its textures [px]
 
 
 def default_folder(scene: Path) -> Path:
@@ -210,7 +210,7 @@ def viewed(ring: FittedObject, views: Sequence[MaskedCamera] | None = None) -> b
 
     `views`: cameras and masks of photographs; the file then marks the vertices that one of them shows. None: no marks.
     """
-    level = min(VIEWED, max(0, ring.subdivisions - 1))  # textures have the details
+    level = min(VIEWED, ring.subdivisions)  # on a coarser mesh, rims have jagged black fringes
     try:
         return gltf.glb(ring, level, max(64, TEXELS >> (VIEWED - level)), views=views)
     except Exception as error:  # the report must be written in any case
