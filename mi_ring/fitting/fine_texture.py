@@ -52,17 +52,17 @@ def chosen_photographs(given: Capture, fitted: Sequence[int] | np.ndarray) -> li
     return [found[place] for place in evenly_spaced(len(found), MOST_PHOTOGRAPHS)]
 
 
-def texture_width(given: Capture, fitted: Sequence[int] | np.ndarray) -> int:
+def texture_width(given: Capture, index: Sequence[int]) -> int:
     """Choose the width to which photographs are reduced for the texture [px]. Returns 0 if there are none.
 
-    `given`: the capture of the fit, which may be reduced. `fitted`: indices of its photographs that are fitted.
+    `given`: the capture of the fit, which may be reduced. `index`: the result of `chosen_photographs`.
     """
-    shots = [given.shots[k] for k in chosen_photographs(given, fitted)]
+    shots = [given.shots[k] for k in index]
     return min(WIDEST, max((shot.window.extent[0] if shot.window else shot.size[0] for shot in shots), default=0))
 
 
 def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray) -> float:
-    """Estimate how long `sharpened` takes [s] on two cores. The arguments are those of `texture_width`."""
+    """Estimate how long `sharpened` takes [s] on two cores. The arguments are those of `chosen_photographs`."""
     return sum(0.5 + 4e-8 * math.prod(given.shots[k].whole.size) for k in chosen_photographs(given, fitted))
 
 
@@ -172,7 +172,8 @@ def sharpened(
     object `ring`, in the light of the fit. `fitted`: indices of the photographs to use. `width`: of the photographs in
     the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
-    index, widest = chosen_photographs(before, fitted), texture_width(before, fitted)
+    index = chosen_photographs(before, fitted)
+    widest = texture_width(before, index)
     if not widest or not albedo_of(ring.brdf_net.bsdf_parameters):
         return ring
     predictor = Predictor(surface, ring, refined)

@@ -98,8 +98,7 @@ def draw(
     to render, and at what size. `spp`: samples per pixel. `shadows`: the photographs' own lights cast shadows.
     `indirect`: add interreflection, rendered with `paths` paths per pixel in a picture that is at most 128 pixels wide.
     The light of the room in `photographs` is always added. So is the texture of a surface that `show` has written.
-    `occlusion`: True: the surface blocks a part of the room
-    light; False: it blocks none of it, which is faster.
+    `occlusion`: True: the surface blocks a part of the room light; False: it blocks none of it, which is faster.
 
     However many pixels and samples there are, this needs about a gigabyte of memory besides the pictures. `indirect` or
     room light need about 100 MB more for each photograph.
