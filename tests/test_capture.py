@@ -198,6 +198,15 @@ def test_small_photographs_are_remembered_as_many_as_fit(small_capture, monkeypa
     assert decodes() == 7
 
 
+def test_cleared_caches_are_filled_again(small_capture, decodes):
+    scene = loading.load_capture(small_capture)
+    first = scene.observe([5, 2], 2)
+    scene.clear_caches()
+    again = scene.observe([5, 2], 2)
+    assert decodes() == 4
+    assert all(torch.equal(a, b) for a, b in zip(first[:4], again[:4], strict=True))
+
+
 @pytest.fixture
 def opened_files(monkeypatch):
     """Names of the photographs and masks that have been read whole."""
@@ -242,6 +251,8 @@ def test_pixels_are_kept_as_many_as_fit_and_shared(monkeypatch):
     assert read == [1, 3, 4, 4]
     part = several.part([4, 1]).replaced({0: reader(5)})
     assert [array[0, 0] for array in part] == [5, 3] and read[4:] == [5]
+    part.clear()
+    assert [array[0, 0] for array in part] == [5, 3] and read[5:] == [5, 3]
 
 
 def test_pixels_may_be_replaced_by_arrays(small_capture):

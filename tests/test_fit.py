@@ -111,6 +111,15 @@ def test_interreflection_is_averaged_beside_a_table(broken_capture, table, indir
     assert counts == ({k: count for k, count in enumerate(seen) if count} if table and indirect else {})
 
 
+def test_photographs_of_a_stage_that_has_ended_are_not_kept_in_memory(small_capture):
+    config = Config(iterations=6, levels=(2, 2), widths=(14, 28), shares=(0.5, 0.5), batch=4, detail="none",
+                    domain="sphere")  # fmt: skip
+    fit = Fit(load_capture(small_capture), config)
+    kept = {it.number: (bool(fit.capture._observed.kept), bool(fit.capture.images.kept)) for it in fit}
+    assert [stage.last for stage in fit.schedule.stages] == [3, 6]
+    assert [kept[k] for k in (2, 3, 5, 6)] == [(True, True), (False, False)] * 2
+
+
 def test_deterministic_fits_see_the_same_normals_of_other_meshes(broken_capture):
     path, edit = broken_capture
     ball = trimesh.creation.icosphere(subdivisions=6)  # so many vertices that threads share the work

@@ -218,6 +218,11 @@ class Capture:
     def _observe(self, k: int, scale: int) -> Observation:
         return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
+    def clear_caches(self) -> None:
+        """Free the memory of all cached pixels. They are read again when they are used."""
+        for cache in (self._observed, self.images, self.masks, self.valid):
+            cache.clear()
+
     def exposure(self) -> float:
         """Estimate the mean linear radiance of the object's pixels (1 = full scale of the files) from some photographs.
 

@@ -100,3 +100,7 @@ class ObservationCache:
         if scale > 1 and pixels + result.mask.numel() <= REMEMBERED_PIXELS:
             self.kept[k] = scale, result
         return result
+
+    def clear(self) -> None:
+        """Remove all observations from the cache."""
+        self.kept.clear()

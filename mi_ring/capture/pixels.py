@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 #: Largest cache of a `Pixels` [bytes]. Other files are read each time.
-KEPT = 2**28
+KEPT = 2**27
 
 Reader = Callable[[], np.ndarray]
 
@@ -42,6 +42,10 @@ class Pixels(Sequence):
         if sum(other.nbytes for other in self.kept.values()) + array.nbytes <= KEPT:
             self.kept[reader] = array
         return array
+
+    def clear(self) -> None:
+        """Remove all arrays from the cache. They are read again when they are used."""
+        self.kept.clear()
 
     @property
     def given(self) -> list[bool]:
