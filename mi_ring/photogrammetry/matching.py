@@ -32,6 +32,7 @@ LENGTH = 512.0  #: of a descriptor
 #: RATIO to find the geometry of two photographs, LOOSE for matches that agree with it.
 ANGLE, RATIO, LOOSE = 0.7, 0.8, 0.95
 FAR = 4.0  #: the largest distance of a match that agrees [px]
+LINE = 16  #: floats in a line of the processor's cache
 BLOCK = 512  #: rows of a matrix of products that is computed at a time, so that it stays in the processor's cache
 ALL_PAIRS = 60  #: all pairs of up to this number of photographs are matched
 SIMILAR, NEIGHBOURS = 30, 12  #: with more: each photograph with the most similar ones, and those next to it by name
@@ -125,21 +126,38 @@ def read_features(database: Path) -> dict[str, Features]:
         }  # fmt: skip
 
 
-def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Find for each of n descriptors the nearest of m others. Returns (indices (n,) into `others`, ratios (n,)).
+class Nearest(NamedTuple):
+    """The nearest of m descriptors for each of n others, by scalar products."""
 
-    `descriptors` (n, 128), `others` (m, 128), uint8. A ratio is the angle to the nearest descriptor, divided by the
-    angle to the second nearest one. It is infinite if the angle to the nearest one is too large for a match.
+    place: torch.Tensor  #: (n,) which one is nearest; m: none
+    first: torch.Tensor  #: (n,) its product
+    second: torch.Tensor  #: (n,) the product of the second nearest one
+    rest: torch.Tensor  #: (m,) the largest product of each of the m with those to which it is not nearest
+
+
+def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> Nearest:
+    """Find for each of n descriptors the nearest of m others.
+
+    `descriptors` (n, 128), `others` (m, 128), uint8.
     """
-    others = torch.cat([others.float(), torch.zeros(1, others.shape[1])])  # the second nearest one if there is only one
+    count = len(others)
+    # Zeros for the second nearest one if there is only one. Rows of whole cache lines halve the time.
+    others = torch.cat([others.float(), torch.zeros(LINE - count % LINE, others.shape[1])])
     buffer, found = torch.empty(BLOCK, len(others)), []  # new memory for each block would take longer than its product
+    rest = torch.zeros(len(others))
     for block in descriptors.split(BLOCK):
         products = torch.mm(block.float(), others.T, out=buffer[: len(block)])
         first, index = products.max(1)
-        found.append((index, first, products.scatter_(1, index[:, None], 0).amax(1)))
-    index, *cosines = map(torch.cat, zip(*found))
-    first, second = (torch.acos((cosine.double() / LENGTH**2).clamp(max=1)) for cosine in cosines)
-    return index, torch.where(first <= ANGLE, first / second, torch.inf)
+        products.scatter_(1, index[:, None], 0)
+        found.append((index.clamp(max=count), first, products.amax(1)))
+        rest = torch.maximum(rest, products.amax(0)) if len(block) else rest
+    place, first, second = map(torch.cat, zip(*found))
+    return Nearest(place, first, second, rest[:count])
+
+
+def angles(products: torch.Tensor) -> torch.Tensor:
+    """Return the angles between descriptors, of which the scalar `products` are given."""
+    return torch.acos((products.double() / LENGTH**2).clamp(max=1))
 
 
 def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -148,13 +166,19 @@ def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.nda
     `first` (n, 128), `second` (m, 128), uint8. A ratio is the angle between the two, divided by the angle to the second
     nearest descriptor; of both directions, the larger one. Pairs with a ratio of `LOOSE` or more are left out.
     """
-    there, ratio = nearest(first, second)
-    rows = (ratio < LOOSE).nonzero()[:, 0]
-    back, other = nearest(second[there[rows]], first)
-    mutual = (back == rows) & (other < LOOSE)
-    rows = rows[mutual]
-    ratios = torch.maximum(ratio[rows], other[mutual])
-    return torch.stack([rows, there[rows]], 1).numpy().astype(np.uint32), ratios.numpy()
+    there, product, other, rest = nearest(first, second)
+    rows = (there < len(second)).nonzero()[:, 0]
+    best = torch.zeros(len(second)).scatter_reduce_(0, there[rows], product[rows], "amax")
+    chosen = product[rows] == best[there[rows]]
+    rivals = rows[~chosen]
+    rest = rest.scatter_reduce_(0, there[rivals], product[rivals], "amax")
+    rows = rows[chosen]
+    alone = torch.bincount(there[rows], minlength=len(second))[there[rows]] == 1
+    angle = angles(product[rows])
+    ratios = angle / angles(torch.maximum(other[rows], rest[there[rows]]))
+    good = alone & (angle <= ANGLE) & (ratios < LOOSE)
+    rows = rows[good]
+    return torch.stack([rows, there[rows]], 1).numpy().astype(np.uint32), ratios[good].numpy()
 
 
 def match_pair(first: Features, second: Features) -> Any:
@@ -220,7 +244,7 @@ def count_words(descriptors: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
 
     `descriptors` (n, 128), `words` (m, 128), uint8. The last bin counts descriptors that are near no word.
     """
-    return torch.bincount(nearest(descriptors, words)[0], minlength=len(words) + 1)
+    return torch.bincount(nearest(descriptors, words).place, minlength=len(words) + 1)
 
 
 def match_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
