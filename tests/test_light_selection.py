@@ -97,6 +97,23 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture, monke
     assert len(tried) == len(set(tried)) and set(tried) <= {*errors, "environment"}
 
 
+@pytest.mark.parametrize(("still", "own", "believed"), [
+    (True, 0.12, "turntable"), (True, 0.096, "capture"), (True, None, "turntable"),
+    (False, 0.12, "environment"), (False, None, "environment"),
+    (None, 0.12, "environment"), (None, None, "turntable"),
+])  # fmt: skip
+def test_a_background_that_stands_still_or_moves_says_where_light_is_fixed(
+    still, own, believed, small_capture, monkeypatch
+):
+    errors = {"turntable": 0.087, "environment": 0.092, "1 lamp": 0.106, "capture": own}
+    capture = mi_ring.load_capture(small_capture)
+    trials = CoarseFits(capture, mi_ring.Config.preset("fast", light="auto"))
+    monkeypatch.setattr(trials, "error", lambda lighting: errors[str(lighting)])
+    monkeypatch.setattr(trials, "brightest", lambda count: Lighting("lamps", (((0, 0, 9), (1, 1, 1)),)))
+    monkeypatch.setattr(light_selection, "is_unlit", lambda capture: own is None)
+    assert str(trials.kind(still)) == believed
+
+
 def test_a_flash_capture_is_found_to_be_one(small_capture):
     capture = mi_ring.load_capture(small_capture)
     config = mi_ring.Config.preset("fast", **TINY, light="auto")

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from mi_ring.calibration.unknowns import OWN_LIGHTS, UNKNOWNS
+from mi_ring.capture.background import stands_still
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
@@ -61,13 +62,13 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     elif config.light == "lamps":
         found = trials.lamps()
     else:
-        likely = [Lighting("environment"), Lighting("turntable")]
-        if math.isfinite(trials.error(likely[0])):  # the environment shows where lamps are
-            likely.insert(1, trials.brightest(1))
-        if not is_unlit(capture):
-            own = trials.error(Lighting("capture"))
-            likely = [one for one in likely if trials.error(one) < BETTER[one.kind] * own] or [Lighting("capture")]
-        found = trials.best(*likely)
+        still = stands_still(capture)
+        if still is not None:
+            print("Light: the background stands still, so the object has turned" if still else
+                  "Light: the background moves, so the object has not turned")  # fmt: skip
+        found = trials.kind(still)
+        if math.isinf(trials.error(found)):
+            found = trials.kind(None)
         if found.kind in ("environment", "lamps"):  # several lamps are between one and an environment
             found = trials.best(found, trials.lamps())
     if math.isinf(trials.error(found)):
@@ -129,6 +130,25 @@ class CoarseFits:
         Runs the coarse fits that have not run before.
         """
         return min(lightings, key=self.error)
+
+    def kind(self, still: bool | None) -> Lighting:
+        """Find the kind of light. `still`: result of `stands_still`. Runs coarse fits.
+
+        If the background stands still, no light is fixed in the world. If it moves, none is fixed in the camera, except
+        that of the scene.
+        """
+        likely = []
+        if not still:
+            likely.append(Lighting("environment"))
+            if math.isfinite(self.error(likely[0])):  # the environment shows where lamps are
+                likely.append(self.brightest(1))
+        if still is not False:
+            likely.append(Lighting("turntable"))
+        if not is_unlit(self.capture):
+            own = Lighting("capture")
+            share = {one: BETTER["environment" if still else one.kind] for one in likely}
+            likely = [one for one in likely if self.error(one) < share[one] * self.error(own)] or [own]
+        return self.best(*likely)
 
     def lamps(self) -> Lighting:
         """Find the smallest number of lamps, up to 3, that explains the photographs about as well as any.
