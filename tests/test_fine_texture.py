@@ -289,7 +289,8 @@ def test_highlights_are_subtracted_and_strong_ones_left_out(print_scene):
     seen = Observation(highlights + 2 * diffuse, whole, mask, torch.tensor([False]), None)
     points = Points.of(faces, 1)
     triangles = np.flatnonzero(predicted.visible[faces].all(1))
-    logarithms, usable = fine_texture.ratios_of(predicted, seen, points, triangles, predicted.pixels)
+    photograph = fine_texture.usable_pixels(seen)
+    logarithms, usable = fine_texture.ratios_of(predicted, photograph, points, triangles, predicted.pixels)
     at = points.at(predicted.pixels, triangles)[:, 0]
     strong = bilinear((highlights > diffuse).any(-1)[0].numpy().astype(np.float32)[..., None], at)[:, 0] == 1
     assert usable.sum() > 1000 and strong.sum() > 20 and not (strong & usable[:, 0]).any()

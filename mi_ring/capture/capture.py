@@ -18,7 +18,7 @@ from mi_ring.capture.observation import Observation, ObservationCache, observed
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import recalibrated_xml, with_photographs
 from mi_ring.errors import InputError, SceneError
-from mi_ring.geometry.camera import Camera, NoParallax, nearest_point
+from mi_ring.geometry.camera import Camera, NoParallax, sphere_of_cameras
 from mi_ring.geometry.hull import MAX_MASKS, MAX_WIDTH, Hull, Silhouette, evenly_spaced, shrink_mask, small_silhouette
 from mi_ring.images import blur
 from mi_ring.plugins import shapenet
@@ -63,7 +63,7 @@ class Capture:
     threshold: float | None = None  #: radiance above which pixels are in masks by brightness; None for given masks
     #: Cache of visual hulls, by masks and cameras. Captures that `replace` makes of this one share it.
     hulls: dict[Hashable, Hull | None] = field(default_factory=dict, repr=False)
-    _observed: ObservationCache = field(default_factory=ObservationCache, init=False, repr=False)
+    observations: ObservationCache = field(default_factory=ObservationCache, init=False, repr=False)
 
     @classmethod
     def from_arrays(
@@ -213,14 +213,14 @@ class Capture:
 
     def observe(self, index: Sequence[int] | np.ndarray, scale: int = 1) -> Observation:
         """Read the photographs `index`, all of one size, and average blocks of `scale` × `scale` pixels."""
-        return Observation.joined([self._observed.get(k, scale, partial(self._observe, k, scale)) for k in index])
+        return Observation.joined([self.observations.get(k, scale, partial(self._observe, k, scale)) for k in index])
 
     def _observe(self, k: int, scale: int) -> Observation:
         return observed(self.shots[k], self.images[k], self.masks[k], self.valid[k], scale)
 
     def clear_caches(self) -> None:
-        """Free the memory of all cached pixels. They are read again when they are used."""
-        for cache in (self._observed, self.images, self.masks, self.valid):
+        """Remove all pixels from the caches, which other captures may share. They are read again when they are used."""
+        for cache in (self.observations, self.images, self.masks, self.valid):
             cache.clear()
 
     def exposure(self) -> float:
@@ -322,7 +322,7 @@ class Capture:
                 middle, ball = self.hull.ball()
                 ball *= 1.3  # a fit starts from this sphere, and shrinking is faster than growing limbs
             else:
-                middle, ball = sphere_of_cameras(self)
+                middle, ball = sphere_of_cameras([shot.whole.camera for shot in self.shots], str(self.path))
             center, radius = middle if center is None else center, ball if radius is None else radius
         return center, radius
 
@@ -338,16 +338,3 @@ def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
             small[reader] = shrink_mask(valid[k], MAX_WIDTH)
     found = [small[reader] for reader in valid.readers]
     return [MaskedCamera(shot.camera.shrunk(scale), mask) for shot, (mask, scale) in zip(shots, found, strict=True)]
-
-
-def sphere_of_cameras(capture: Capture) -> tuple[np.ndarray, float]:
-    """Estimate a sphere around the object from the cameras alone. Returns (centre (3,), radius) [scene units].
-
-    The centre is the point nearest to all optical axes. The radius is half that of the largest ball around this centre
-    which every camera sees completely.
-    """
-    cameras = [shot.whole.camera for shot in capture.shots]
-    origins = np.stack([camera.position for camera in cameras])
-    center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), str(capture.path))
-    half_angle = min(np.arctan(min(camera.size) / 2 / camera.focal.max()) for camera in cameras)
-    return center, float(0.5 * np.sin(half_angle) * np.linalg.norm(origins - center, axis=1).min())

@@ -196,7 +196,7 @@ def in_turn(function: Callable[[int], Any], capture: Capture, index: Sequence[in
     def memory(shot: Shot) -> int:
         file = shot.files.filename
         small = file is not None and file.suffix.lower() in (".jpg", ".jpeg") and not shot.files.ambient
-        return math.prod(shot.size) * (JPEG_BYTES if small else PIXEL_BYTES)
+        return math.prod(shot.whole.size) * (JPEG_BYTES if small else PIXEL_BYTES)
 
     most = max(1, DECODING // max(map(memory, capture.shots)))
     results = in_threads(function, index, most=most)

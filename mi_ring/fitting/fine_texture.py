@@ -42,6 +42,7 @@ COARSE = 8.0  #: differences that are coarser than this are left out [px of the 
 MOST_POINTS, MOST_PHOTOGRAPHS = 8_000_000, 80
 DARK, GLOSSY = 0.03, 0.5  #: least prediction [median of the object], and largest share of highlights in it
 LARGEST = 1.5  #: largest change of a colour, as a logarithm
+AT_ONCE = 2**19  #: points that are compared at once: all of them would take too much memory
 SQUARE = np.ones((3, 3), np.uint8)  #: a pixel and its neighbours
 SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
 
@@ -138,16 +139,22 @@ def eroded(mask: np.ndarray) -> np.ndarray:
     return cv2.erode(mask.astype(np.uint8), SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-def ratios_of(expected: Expected, seen: Observation, points: Points, triangles: np.ndarray, pixels: np.ndarray
+def usable_pixels(seen: Observation) -> np.ndarray:
+    """Return a photograph as (h, w, 4) float32: linear R, G, B, and 1 where a pixel is usable, otherwise 0.
+
+    A pixel is usable if all pixels up to two pixels away show nothing but the object, not clipped.
+    """
+    usable = seen.surely(torch.ones(1)).numpy()[0] & ~seen.clipped[0].numpy().any(-1)
+    return np.dstack([seen.rgb[0].numpy(), eroded(eroded(usable))]).astype(np.float32)
+
+
+def ratios_of(expected: Expected, photograph: np.ndarray, points: Points, triangles: np.ndarray, pixels: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Compare a photograph with its prediction. Returns (logarithms of ratios (f, n, 3), which are usable (f, n)).
 
-    A ratio is usable if photograph and prediction show there nothing but the object, lit, neither clipped nor in a
-    highlight. `seen`: the photograph. `pixels` (V, 2): the vertices in it. `points`: n points in each triangle.
-    `triangles` (f,): those to compare.
+    A ratio is usable if the pixels of photograph and prediction are. `photograph`: result of `usable_pixels`. `pixels`
+    (V, 2): the vertices in it. `points`: n points in each triangle. `triangles` (f,): those to compare.
     """
-    usable = seen.surely(torch.ones(1)).numpy()[0] & ~seen.clipped[0].numpy().any(-1)
-    photograph = np.dstack([seen.rgb[0].numpy(), eroded(eroded(usable))]).astype(np.float32)
 
     def at_points(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
         at = points.at(places, triangles)
@@ -197,10 +204,12 @@ def sharpened(
         weights = ((normals * away).sum(1) / distance).clip(0, 1) ** SLANT
         weights *= (camera.focal.mean() / resolution / distance) ** 2
         triangles = np.flatnonzero(expected.visible[faces].all(1))
-        seen, (pixels, _) = enlarged(before, k, *shots[k]), camera.project(vertices)
-        logarithms, usable = ratios_of(expected, seen, ratios.points, triangles, pixels)
-        weight = usable * ratios.points.at(weights[:, None], triangles)[..., 0]
-        ratios.add(index.index(k) % 2, triangles, logarithms, weight)
+        photograph, (pixels, _) = usable_pixels(enlarged(before, k, *shots[k])), camera.project(vertices)
+        half, parts = index.index(k) % 2, 1 + len(triangles) * len(ratios.points.shares) // AT_ONCE
+        for part in np.array_split(triangles, parts):
+            logarithms, usable = ratios_of(expected, photograph, ratios.points, part, pixels)
+            weight = usable * ratios.points.at(weights[:, None], part)[..., 0]
+            ratios.add(half, part, logarithms, weight)
 
     for _ in progress(pipelined(predicted, compare, index), "texture", len(index)):
         pass

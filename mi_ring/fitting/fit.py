@@ -114,10 +114,8 @@ class Fit(Renamed):
         self.course.iteration += 1
         self.optimisation.prepare(self.schedule, self.iteration)
         self.course.seconds += time.perf_counter() - started
-        if it.number == it.stage.last:
-            self.capture.clear_caches()  # the next stage has other sizes
         if it.number in (it.stage.first + 1, it.stage.last):
-            release_memory()  # a stage's first iteration needs more than others
+            release_memory()  # a stage's first iteration needs more than others; the next stage has other sizes
         if (last := it.number == self.iterations) and len(self.problem.held_out):
             masked = replace(self.problem, capture=self.capture)
             self.course.validation = validate(masked, self.model, self.renderer, self.schedule.final_level)

@@ -82,5 +82,6 @@ def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
 
     if not masks:
         return capture
+    capture.observations.clear()  # with other masks
     readers = {k: partial(enlarged, mask, capture.shots[k].size) for k, mask in masks.items()}
     return replace(capture, masks=capture.masks.replaced(readers))

@@ -43,6 +43,7 @@ def result_of(
 
     detailed = schedule.stages[-1].detail and "detail" not in course.validation.get("put_back", [])
     if course.iteration == schedule.iterations and detailed and problem.config.detail != "shape":
+        capture.clear_caches()
         release_memory()  # of the last stage
         try:
             shown = renderer.show(model, ring.subdivisions)

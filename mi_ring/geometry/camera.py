@@ -210,3 +210,15 @@ def nearest_point(origins: np.ndarray, directions: np.ndarray, what: str) -> np.
         raise NoParallax(f"{what}: to_world: all cameras are in one place or look along one line, so the object's "
                          "place is unknown; if that is so, give center and radius of the shapenet shape")  # fmt: skip
     return np.linalg.solve(matrix, right)
+
+
+def sphere_of_cameras(cameras: Sequence[Camera], what: str) -> tuple[np.ndarray, float]:
+    """Estimate a sphere around the object from the cameras alone. Returns (centre (3,), radius) [scene units].
+
+    The centre is the point nearest to all optical axes. The radius is half that of the largest ball around this centre
+    which every camera sees completely. Raises NoParallax if there is no such point. The message begins with `what`.
+    """
+    origins = np.stack([camera.position for camera in cameras])
+    center = nearest_point(origins, np.stack([camera.forward for camera in cameras]), what)
+    half_angle = min(np.arctan(min(camera.size) / 2 / camera.focal.max()) for camera in cameras)
+    return center, float(0.5 * np.sin(half_angle) * np.linalg.norm(origins - center, axis=1).min())

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from mi_ring.capture.capture import Capture, sphere_of_cameras
+from mi_ring.capture.capture import Capture
+from mi_ring.geometry.camera import sphere_of_cameras
 from mi_ring.geometry.hull import NoHull
 from mi_ring.images import encoded_picture
 from mi_ring.metrics.capture_findings import capture_findings, facing, measure, quality_table, without_empty_masks
@@ -53,7 +54,7 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     try:
         center, radius = capture.sphere()
     except NoHull as error:
-        center, radius = sphere_of_cameras(capture)
+        center, radius = sphere_of_cameras([shot.whole.camera for shot in capture.shots], str(capture.path))
         found += [] if capture.whole else [str(error)]
     advance()
     agreement, wrong = agreements(capture)
