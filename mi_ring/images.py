@@ -36,6 +36,7 @@ from mi_ring.system.optional import need
 #: Full scale and bits of cameras whose values may be stored in the low bits of 16.
 LOW_BITS = {1023: 10, 4095: 12, 16383: 14}
 MAX_LABELS = 32  #: largest number of values in a mask of labels; more are a picture
+ROWS = 256  #: of a strip of an image
 EXR_CHUNK = 256  #: rows of the largest chunk of an OpenEXR file; its reader allocates one for an image of one row, too
 
 Pictures = TypeVar("Pictures", np.ndarray, Tensor)
@@ -103,11 +104,21 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
             else:
                 if image.mode not in ("L", "RGB"):
                     image = image.convert("L" if image.mode == "1" else "RGB")
-                pixels = np.asarray(image)  # without a copy: it may be large
+                pixels = pixels_of(image)
     pixels = pixels if pixels.ndim == 3 else pixels[:, :, None]
     if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
         raise ValueError(f"contains pixels that are NaN, infinite or above {LARGEST:g}")
     return as_stated(pixels, statement_of(path)) if heed else pixels
+
+
+def pixels_of(image: Image.Image) -> np.ndarray:
+    """Return the pixels (H, W, C) uint8 of an image. In strips, because Pillow would hold two more copies of them."""
+    width, height = image.size
+    pixels = np.empty((height, width, len(image.getbands())), np.uint8)
+    for top in range(0, height, ROWS):
+        strip = image.crop((0, top, width, min(top + ROWS, height)))
+        pixels[top : top + ROWS] = np.asarray(strip).reshape(strip.height, width, -1)
+    return pixels
 
 
 def largest_value(pictures: Iterable[np.ndarray]) -> int:

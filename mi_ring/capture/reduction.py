@@ -210,18 +210,21 @@ def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
     photograph of 8 bits, otherwise float32.
     """
     image = read()
-    radiance, clipped = [], []
+    kept = np.float16 if image.dtype == np.uint8 else np.float32
     blocks, (left, top), (width, height) = window.blocks, window.corner, window.extent
-    rows = blocks * max(1, ROWS // blocks)
-    for first in range(top, top + height, rows):
-        part = image[first : min(first + rows, top + height), left : left + width]
+    radiance = np.empty((height // blocks, width // blocks, 3), np.float32)
+    clipped = np.zeros(radiance.shape, bool)
+    rows = max(1, ROWS // blocks)
+    for first in range(0, len(radiance), rows):
+        part = image[top + blocks * first : top + min(blocks * (first + rows), height), left : left + width]
         linear, over = decode(part, is_linear(shot.encoding, part), shot.saturation, shot.response.gamma,
                               shot.response.contrast)  # fmt: skip
-        radiance.append(averaged(linear, blocks))
-        clipped.append(averaged(over, blocks) > 0 if over.any() else np.zeros(radiance[-1].shape, bool))
-    over = resized(np.concatenate(clipped).astype(np.float32), window) > 0
-    return LinearImage(resized(np.concatenate(radiance), window).astype(
-        np.float16 if image.dtype == np.uint8 else np.float32), over)  # fmt: skip
+        radiance[first : first + rows] = averaged(linear, blocks)
+        if over.any():
+            clipped[first : first + rows] = averaged(over, blocks) > 0
+    del image  # it takes more memory than what was made of it
+    over = resized(clipped.astype(np.float32), window) > 0
+    return LinearImage(resized(radiance, window).astype(kept), over)
 
 
 def reduced_mask(read: Reader, window: Window) -> np.ndarray:

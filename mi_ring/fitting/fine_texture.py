@@ -145,7 +145,7 @@ def usable_pixels(seen: Observation) -> np.ndarray:
     A pixel is usable if all pixels up to two pixels away show nothing but the object, not clipped.
     """
     usable = seen.surely(torch.ones(1)).numpy()[0] & ~seen.clipped[0].numpy().any(-1)
-    return np.dstack([seen.rgb[0].numpy(), eroded(eroded(usable))]).astype(np.float32)
+    return cv2.merge([*cv2.split(seen.rgb[0].numpy()), eroded(eroded(usable)).astype(np.float32)])
 
 
 def ratios_of(expected: Expected, photograph: np.ndarray, points: Points, triangles: np.ndarray, pixels: np.ndarray
