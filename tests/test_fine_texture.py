@@ -252,6 +252,12 @@ def test_photographs_as_small_as_those_of_the_fit_count(tmp_path):
     assert (found * true)[wide].sum() / (true**2)[wide].sum() == pytest.approx(1, abs=0.25)
 
 
+def test_parts_of_the_surface_give_the_texture_of_the_whole(print_scene, sharp, monkeypatch):
+    monkeypatch.setattr(fine_texture, "AT_ONCE", 1000)
+    parts = sharpened(load_capture(print_scene, width=40), pale_ball())
+    assert torch.equal(parts.brdf_net.grid.values[0], sharp.brdf_net.grid.values[0])
+
+
 def test_of_many_photographs_some_are_used(print_scene, monkeypatch):
     capture = load_capture(print_scene, width=40)
     monkeypatch.setattr(fine_texture, "MOST_PHOTOGRAPHS", 4)

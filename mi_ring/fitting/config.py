@@ -46,7 +46,7 @@ class Common:
     environment: unknown light from all sides. It does not move, while the camera moves around the object.
     turntable: unknown light from all sides. It stands still relative to the camera, while the object turns.
     lamps: one to three unknown lamps. They do not move, while the camera moves around the object.
-    auto: one of these four. Coarse fits find out which kind explains the photographs best. This takes longer."""
+    auto: one of these four. The background of the photographs and coarse fits tell which. This takes longer."""
     refine: tuple[Unknown, ...] = ("auto",)
     """Calibration that the fit corrects, in addition to surface and material. Initial values come from the scene file.
     auto: light, power, ambient. Also scale, if with these lights the object would reflect more light than it gets.
