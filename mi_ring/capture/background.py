@@ -49,15 +49,14 @@ def background_difference(capture: Capture) -> float | None:
     seen = in_turn(partial(small_background, capture), capture, index, "looking at the background")
     pictures, shown = np.stack([fine_structure(*one) for one in seen]), np.stack([one[1] for one in seen])
     least = []
-    for picture, here in zip(pictures, shown):
-        common = here & shown
-        count = common.sum((1, 2)).clip(min=1)
-        change, both = (np.square(x, where=common, out=np.zeros(common.shape)).sum((1, 2)) / count
-                        for x in (pictures - picture, np.sqrt((pictures**2 + picture**2) / 2)))  # fmt: skip
-        told = (count >= SHOWN * here.size) & (both > VARIED**2)
-        differences = np.sort((change / 2)[told] / both[told])
-        if len(differences) >= FEWEST:  # with itself: 0
-            least.append(differences[1])
+    for k in range(len(index)):
+        both = np.delete(shown, k, 0) & shown[k]
+        others, own, count = np.delete(pictures, k, 0), pictures[k], both.sum((1, 2))
+        change, variance = (np.where(both, squares, 0).sum((1, 2)) / (2 * count.clip(min=1))
+                            for squares in ((others - own) ** 2, others**2 + own**2))  # fmt: skip
+        told = (count >= SHOWN * own.size) & (variance > VARIED**2)
+        if told.sum() >= FEWEST - 1:
+            least.append((change[told] / variance[told]).min())
     return float(np.median(least)) if 2 * len(least) > len(index) else None
 
 

@@ -89,11 +89,11 @@ class Sampler:
     def observe(self, problem: Problem, capture: Capture, batch: Batch) -> Observation:
         """Read this process's photographs of a batch from `capture`, at the scale of the batch.
 
-        At the first iteration of a stage, the cached photographs of the stage before are removed. Raises InputError in
-        all processes if one process cannot read its files.
+        At the first iteration of a stage, the cached photographs of the stage before are removed: the next stage needs
+        more memory. Raises InputError in all processes if one process cannot read its files.
         """
         if 1 < batch.number == batch.stage.first + 1:
-            capture.observations.clear()  # of the stage before, with other sizes
+            capture.clear_caches()  # what the stage before has used
         seen = problem.processes.agreed(lambda: capture.observe(batch.photographs, batch.scale))
         return seen.to(problem.device)
 
