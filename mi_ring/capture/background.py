@@ -9,34 +9,40 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import read_mask, read_photograph
 from mi_ring.capture.observation import observed
 from mi_ring.capture.reduction import in_turn, reduced_image, reduced_mask, reduced_valid, whole_mask, windowed
+from mi_ring.errors import InputError
 from mi_ring.geometry.hull import evenly_spaced
 
 MOST, FEWEST = 16, 3  #: photographs that are compared
 WIDTH = 64  #: to which they are reduced [px]
-SHOWN = 0.1  #: least share of the pixels that both of two photographs must show as background
+TILE = 8  #: side of the squares of a photograph that are compared [px]
+SHOWN = 0.3  #: least share of the squares that both of two photographs must show as background with structure
 NEAR = 2  #: pixels around the object that are left out: shadows and blur
 COARSE = 3.0  #: standard deviation of the blur that is subtracted [px]: light and lens darken corners of any picture
-VARIED = 0.01  #: least standard deviation of what remains, relative to the background's mean
-STILL, MOVES = 0.2, 0.6  #: largest difference of a background that stands still, and smallest of one that moves
+VARIED = 0.01  #: least standard deviation of what remains in a square, relative to the background's mean
+DARK = 0.02  #: pixels below this share of the background's mean are left out: borders of undistorted photographs
+TURNED = 10.0  #: least rotation between the cameras of two photographs that are compared [degrees]
+STILL = 0.3  #: largest difference of backgrounds that are the same
 
 
-def stands_still(capture: Capture) -> bool | None:
-    """Test whether the camera stood still, because photographs have the same background.
+def stands_still(capture: Capture) -> bool:
+    """Test whether the camera stood still: photographs from other sides of the object have the same background.
 
-    True: it did, or there were several cameras that did. False: the background moves. None: it does not tell; it is
-    black, uniform or cut out, or there are too few photographs with masks. Raises InputError if a file cannot be read.
+    False: the background moves, or it does not tell: it is black, plain, cut out or cannot be read, or too few
+    photographs have masks.
     """
-    difference = background_difference(capture)
-    if difference is None or STILL < difference < MOVES:
-        return None
-    return difference <= STILL
+    try:
+        difference = background_difference(capture)
+    except InputError:  # a file has gone, of which the fit needs only what is cached
+        return False
+    return difference is not None and difference <= STILL
 
 
 def background_difference(capture: Capture) -> float | None:
-    """Return how much a photograph's background differs from the most similar one: 0 not at all, 1 completely.
+    """Return how much a photograph's background differs from the most similar one from another side of the object.
 
-    The result is the median over photographs. The difference is half the variance of the difference, divided by the
-    variance, of fine structure alone. None: the background is black, uniform or not seen.
+    0: not at all, 1: completely. It is the median over photographs, and over squares of them: half the variance of the
+    difference, divided by the variance, of fine structure alone. None: the background is black, plain or not seen.
+    Raises InputError if a file cannot be read.
     """
     sizes: dict[tuple[int, int], list[int]] = {}
     for k, shot in enumerate(capture.shots):
@@ -48,16 +54,34 @@ def background_difference(capture: Capture) -> float | None:
     index = [alike[k] for k in evenly_spaced(len(alike), MOST)]
     seen = in_turn(partial(small_background, capture), capture, index, "looking at the background")
     pictures, shown = np.stack([fine_structure(*one) for one in seen]), np.stack([one[1] for one in seen])
+    turns = np.stack([capture.shots[k].camera.to_world[:3, :3] for k in index])
     least = []
-    for k in range(len(index)):
-        both = np.delete(shown, k, 0) & shown[k]
-        others, own, count = np.delete(pictures, k, 0), pictures[k], both.sum((1, 2))
-        change, variance = (np.where(both, squares, 0).sum((1, 2)) / (2 * count.clip(min=1))
-                            for squares in ((others - own) ** 2, others**2 + own**2))  # fmt: skip
-        told = (count >= SHOWN * own.size) & (variance > VARIED**2)
-        if told.sum() >= FEWEST - 1:
-            least.append((change[told] / variance[told]).min())
+    for own, here, turn in zip(pictures, shown, turns):
+        angles = np.degrees(np.arccos(((turns * turn).sum((1, 2)) / 2 - 0.5).clip(-1, 1)))
+        differences = [difference(own, pictures[k], here & shown[k]) for k in np.flatnonzero(angles > TURNED)]
+        told = [value for value in differences if value is not None]
+        if len(told) >= FEWEST - 1:
+            least.append(min(told))
     return float(np.median(least)) if 2 * len(least) > len(index) else None
+
+
+def difference(first: np.ndarray, second: np.ndarray, shown: np.ndarray) -> float | None:
+    """Return how much two pictures of fine structure (h, w) differ, as `background_difference` does.
+
+    `shown` (h, w): the pixels to compare. None: too few squares of the pictures have structure.
+    """
+    height, width = (side // TILE * TILE for side in first.shape)
+
+    def sums(values: np.ndarray) -> np.ndarray:
+        return values[:height, :width].reshape(height // TILE, TILE, width // TILE, TILE).sum((1, 3))
+
+    count = sums(shown)
+    change, variance = (sums(np.where(shown, squares, 0)) / (2 * count.clip(min=1))
+                        for squares in ((first - second) ** 2, first**2 + second**2))  # fmt: skip
+    told = (count >= TILE**2 / 2) & (variance > VARIED**2)
+    if told.sum() < SHOWN * max(told.size, 1):
+        return None
+    return float(np.median(change[told] / variance[told]))
 
 
 def is_seen(capture: Capture, k: int) -> bool:
@@ -69,7 +93,7 @@ def is_seen(capture: Capture, k: int) -> bool:
 def small_background(capture: Capture, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Return photograph `k`, whole and small: (mean of linear R, G, B (h, w), which pixels are background (h, w)).
 
-    The background is what is valid and not near the object.
+    The background is what is valid, not near the object and not black.
     """
     shot = capture.shots[k]
     whole, read, mask, valid = shot.whole, *(getattr(capture, name).readers[k] for name in ("images", "masks", "valid"))
@@ -82,7 +106,8 @@ def small_background(capture: Capture, k: int) -> tuple[np.ndarray, np.ndarray]:
     outside = cv2.dilate(reduced_mask(lambda: whole_mask(mask(), shot.window), window), np.ones((size, size))) < 8
     if valid:
         outside &= reduced_valid(valid, window) > 0
-    return rgb.mean(-1), outside
+    picture = rgb.mean(-1)
+    return picture, outside & (picture > DARK * picture[outside].mean()) if outside.any() else outside
 
 
 def fine_structure(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.scene.visibility import MaskedCamera, Visibility
-from mi_ring.system.machine import pipelined
+from mi_ring.system.machine import pipelined, release_memory
 from mi_ring.system.progress import progress
 
 WIDEST = 2048  #: to which photographs are reduced for the texture [px]
@@ -195,6 +195,7 @@ def sharpened(
     ratios = Ratios(Points.of(faces, divisions))
 
     def predicted(k: int) -> Expected:
+        release_memory()  # of the photograph before
         return predictor.of(at_width(before.shots[k], refined.shots[k], min(widest, max(width, PREDICTED)))[1])
 
     def compare(k: int, expected: Expected) -> None:

@@ -63,12 +63,11 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
         found = trials.lamps()
     else:
         still = stands_still(capture)
-        if still is not None:
-            print("Light: the background stands still, so the object has turned" if still else
-                  "Light: the background moves, so the object has not turned")  # fmt: skip
+        if still:
+            print("Light: photographs have the same background, so the object has turned before the camera")
         found = trials.kind(still)
         if math.isinf(trials.error(found)):
-            found = trials.kind(None)
+            found = trials.kind(still=False)
         if found.kind in ("environment", "lamps"):  # several lamps are between one and an environment
             found = trials.best(found, trials.lamps())
     if math.isinf(trials.error(found)):
@@ -131,19 +130,16 @@ class CoarseFits:
         """
         return min(lightings, key=self.error)
 
-    def kind(self, still: bool | None) -> Lighting:
-        """Find the kind of light. `still`: result of `stands_still`. Runs coarse fits.
+    def kind(self, still: bool) -> Lighting:
+        """Find the kind of light. Runs coarse fits.
 
-        If the background stands still, no light is fixed in the world. If it moves, none is fixed in the camera, except
-        that of the scene.
+        `still`: result of `stands_still`. If it is True, no light is fixed in the world: the object turned.
         """
-        likely = []
+        likely = [Lighting("turntable")]
         if not still:
-            likely.append(Lighting("environment"))
+            likely.insert(0, Lighting("environment"))
             if math.isfinite(self.error(likely[0])):  # the environment shows where lamps are
-                likely.append(self.brightest(1))
-        if still is not False:
-            likely.append(Lighting("turntable"))
+                likely.insert(1, self.brightest(1))
         if not is_unlit(self.capture):
             own = Lighting("capture")
             share = {one: BETTER["environment" if still else one.kind] for one in likely}

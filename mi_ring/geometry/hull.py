@@ -94,7 +94,7 @@ class Hull:
         self.distances = [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
         origins = np.stack([s.camera.position for s in self.silhouettes])
         rays = [self.rays(s, outline=True) for s in self.silhouettes]
-        self.center = nearest_point(origins, np.stack([r.mean(0) / np.linalg.norm(r.mean(0)) for r in rays]), what)
+        self.center = nearest_point(origins, np.stack([self.middle(s) for s in self.silhouettes]), what)
         across = (np.cross(r, self.center - o) for r, o in zip(rays, origins))
         self.reach = max(np.linalg.norm(a, axis=1).max() for a in across)
 
@@ -111,6 +111,11 @@ class Hull:
         if not len(rows):
             raise InputError(f"{silhouette.name}: mask: is empty, or nearly: no pixels above 127")
         return silhouette.camera.directions(np.stack([columns, rows], 1) + 0.5)
+
+    @staticmethod
+    def middle(silhouette: Silhouette) -> np.ndarray:
+        """Return the world direction (3,), of length 1, of the ray through the middle of the object's pixels."""
+        return silhouette.camera.directions(np.argwhere(silhouette.mask > 127).mean(0)[None, ::-1] + 0.5)[0]
 
     def depth(self, points: Tensor) -> Tensor:
         """Return the approximate signed distance (N,) of points (N, 3) from the hull's surface, positive inside.
@@ -219,7 +224,11 @@ class Hull:
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:
-    """Return the distance (H, W) [px] of each pixel's centre from the outline of a mask (H, W), positive inside."""
-    inside = (mask > 127).astype(np.uint8)
-    within, without = (cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (inside, 1 - inside))
+    """Return the distance (H, W) [px] of each pixel's centre from the outline of a mask (H, W), positive inside.
+
+    Without an outline, it is the diagonal of the mask.
+    """
+    inside, most = (mask > 127).astype(np.uint8), math.hypot(*mask.shape)
+    within, without = (cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).clip(max=most)
+                       for part in (inside, 1 - inside))  # fmt: skip
     return np.where(inside, within - 0.5, 0.5 - without)
