@@ -56,7 +56,7 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     if exposed.max() > ALIKE * exposed.min():
         print(f"Light: those of the scene differ in strength, by up to {exposed.max() / exposed.min():.2g} times, "
               "which an unknown light takes to be how the photographs were exposed")  # fmt: skip
-    trials = CoarseFits(capture, config)
+    trials, still = CoarseFits(capture, config), False
     if config.light in ("environment", "turntable"):
         found = Lighting(config.light)
     elif config.light == "lamps":
@@ -76,6 +76,10 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
         found = trials.with_material(found)
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
     rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
+    if Lighting("capture") in trials.errors:
+        least = BETTER | ({"turntable": BETTER["environment"]} if still else {})
+        rule += ("; those of the scene are kept unless another leaves at most {environment:g} of their error, "
+                 "turntable {turntable:g}").format(**least)  # fmt: skip
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
     return found
 

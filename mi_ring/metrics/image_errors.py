@@ -11,6 +11,7 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
+from mi_ring.system.progress import progress
 
 SPP = 64  #: default samples per pixel of predicted photographs
 WINDOW = 11  #: width of the window of SSIM [px]
@@ -30,7 +31,8 @@ def compare_photographs(
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     squares = []
     views: list[dict] = []
-    for k in range(len(capture)) if index is None else index:
+    index = range(len(capture)) if index is None else index
+    for k in progress(index, "comparing", len(index), unit="photograph"):
         rgb, _ = prediction.draw(
             surface, capture.photograph(k), spp=spp, shadows=capture.shadows, indirect=ring.indirect
         )
