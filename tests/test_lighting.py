@@ -324,12 +324,15 @@ def test_only_light_that_was_unknown_is_said_to_be(tmp_path):
     assert "smooth" in ambiguity("environment on one material") and "smooth" not in ambiguity("2 distant lamps")
 
 
-def test_a_background_that_is_seen_needs_masks(in_an_environment):
+def test_unknown_light_needs_given_masks(in_an_environment, small_capture):
     scene = in_an_environment.with_name("unmasked.xml")
     scene.write_text(re.sub(r'<string name="mask"[^>]*>', "", in_an_environment.read_text()))
     capture = mi_ring.load_capture(scene)
     with pytest.raises(InputError, match="unmasked.xml: mask: no photograph has one"):
         mi_ring.choose_lighting(capture, mi_ring.Config.preset("fast", **TINY, light="environment"))
+    bright = mi_ring.load_capture(small_capture, masks="none")  # masks by brightness, which lack what is dark
+    with pytest.raises(InputError, match="mask: no photograph has one"):
+        mi_ring.choose_lighting(bright, mi_ring.Config.preset("fast", **TINY, light="auto"))
 
 
 def test_photographs_without_lights_of_their_own_have_none_in_the_table(in_an_environment):

@@ -96,7 +96,7 @@ def require_compatible(capture: Capture, config: Config) -> None:
     if any(shot.files.ambient for shot in capture.shots):
         raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
                          f"leave out --light {config.light}, or `ambient` in all photographs")  # fmt: skip
-    if not any(capture.masks.given):
+    if capture.threshold is not None or not any(capture.masks.given):
         raise InputError(f"{capture.path}: mask: no photograph has one, and by --light {config.light} the "
                          "background would be taken for the object; give masks, or have mi-ring photos "
                          "find them")  # fmt: skip
