@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mi_ring.errors import InputError
-from mi_ring.synthesis.example_pot import write_example
+from mi_ring.synthesis.example_pot import VIEWS, write_example
 from mi_ring.system import command
 from mi_ring.system.files import whole_folder, writing
 
@@ -28,7 +28,7 @@ def main(arguments: Sequence[str]) -> None:
         here = folder.resolve() == Path.cwd()  # it cannot be replaced
         if here or (folder.exists() and not (folder.is_dir() and not any(folder.iterdir()))):
             raise InputError(f"{folder}: DIR: is there already; give another name")
-    print("Path tracing 28 photographs takes one to three minutes", flush=True)
+    print(f"Path tracing {VIEWS} photographs takes one to three minutes", flush=True)
     with whole_folder(folder) as growing:
         write_example(growing)
     print(f"{folder}/scene.xml, and the true surface in {folder}/truth/mesh.ply\n"

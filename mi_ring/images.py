@@ -104,14 +104,14 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
             else:
                 if image.mode not in ("L", "RGB"):
                     image = image.convert("L" if image.mode == "1" else "RGB")
-                pixels = pixels_of(image)
+                pixels = decoded_in_strips(image)
     pixels = pixels if pixels.ndim == 3 else pixels[:, :, None]
     if pixels.dtype == np.float32 and not (np.abs(pixels) <= LARGEST).all():
         raise ValueError(f"contains pixels that are NaN, infinite or above {LARGEST:g}")
     return as_stated(pixels, statement_of(path)) if heed else pixels
 
 
-def pixels_of(image: Image.Image) -> np.ndarray:
+def decoded_in_strips(image: Image.Image) -> np.ndarray:
     """Return the pixels (H, W, C) uint8 of an image. In strips, because Pillow would hold two more copies of them."""
     width, height = image.size
     pixels = np.empty((height, width, len(image.getbands())), np.uint8)

@@ -122,7 +122,11 @@ def test_photographs_from_the_same_place_are_not_compared(small_capture):
 @pytest.mark.parametrize("moves", [False, True])
 def test_photographs_that_are_cropped_to_the_object_are_read_whole(moves, capture_of, tmp_path):
     large = [[cv2.resize(part, (9 * WIDTH, 9 * HEIGHT)) for part in parts] for parts in photographs(moves)]
-    capture = capture_of(*large)
+    shown = np.ones((9 * HEIGHT, 9 * WIDTH), bool)
+    shown[:200, :300] = False
+    for image in large[0]:
+        image[~shown] = 255
+    capture = capture_of(*large, valid=[shown] * COUNT)
     assert not stands_still(reduced(capture, 64))  # there is no file to read again
     small = reduced(capture.save(tmp_path / "scene.xml"), 64)
     assert all(shot.window.share < 0.5 for shot in small.shots)

@@ -295,7 +295,7 @@ def test_highlights_are_subtracted_and_strong_ones_left_out(print_scene):
     seen = Observation(highlights + 2 * diffuse, whole, mask, torch.tensor([False]), None)
     points = Points.of(faces, 1)
     triangles = np.flatnonzero(predicted.visible[faces].all(1))
-    photograph = fine_texture.usable_pixels(seen)
+    photograph = fine_texture.with_usable_pixels(seen)
     logarithms, usable = fine_texture.ratios_of(predicted, photograph, points, triangles, predicted.pixels)
     at = points.at(predicted.pixels, triangles)[:, 0]
     strong = bilinear((highlights > diffuse).any(-1)[0].numpy().astype(np.float32)[..., None], at)[:, 0] == 1

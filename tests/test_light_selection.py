@@ -110,7 +110,32 @@ def test_a_background_that_stands_still_says_that_light_is_fixed_in_the_camera(
     monkeypatch.setattr(trials, "error", lambda lighting: errors[str(lighting)])
     monkeypatch.setattr(trials, "brightest", lambda count: Lighting("lamps", (((0, 0, 9), (1, 1, 1)),)))
     monkeypatch.setattr(light_selection, "is_unlit", lambda capture: own is None)
-    assert str(trials.kind(still)) == believed
+    assert str(trials.likeliest(still)) == believed
+
+
+@pytest.mark.parametrize(("errors", "believed", "limit"), [
+    ({"turntable": 0.08, "capture": 0.1, "turntable on one material": 0.1}, "turntable", "turntable 0.9"),
+    ({"turntable": None, "capture": 0.1, "environment": 0.08, "1 lamp": 0.2, "2 lamps": 0.2, "3 lamps": 0.2,
+      "1 distant lamp": 0.2, "environment on one material": 0.1}, "environment", "turntable 0.6"),
+])  # fmt: skip
+def test_in_front_of_a_background_that_stands_still_a_turntable_is_tried_first(
+    errors, believed, limit, small_capture, monkeypatch, capsys
+):
+    def error(trials, lighting):
+        value = errors[str(lighting)]
+        trials.errors[lighting] = np.inf if value is None else value
+        trials.found[lighting] = lighting
+        return trials.errors[lighting]
+
+    monkeypatch.setattr(light_selection, "stands_still", lambda capture: True)
+    monkeypatch.setattr(CoarseFits, "error", error)
+    lamp = (0.0, 0.0, 9.0), (1.0, 1.0, 1.0)
+    monkeypatch.setattr(CoarseFits, "brightest", lambda _, n, distant=False: Lighting("lamps", (lamp,) * n, distant))
+    monkeypatch.setattr(CoarseFits, "are_apart", lambda trials, lamps: True)
+    capture = mi_ring.load_capture(small_capture)
+    assert str(mi_ring.choose_lighting(capture, mi_ring.Config.preset("fast", light="auto"))) == believed
+    said = capsys.readouterr().out
+    assert "the object turned" in said and limit in said
 
 
 def test_a_flash_capture_is_found_to_be_one(small_capture):

@@ -81,6 +81,17 @@ def test_the_bar_shows_the_time_that_all_steps_need(clock):
     assert "done in" not in str(bar)
 
 
+def test_at_the_end_of_the_last_step_no_time_is_left(clock):
+    with Steps([Part("reading", 1)]):
+        bar = progress.progress(range(4), "reading", file=io.StringIO())
+        clock[0] += 60
+        bar.update(3)
+        assert "all done in 20 s" in str(bar)
+        clock[0] += 20
+        bar.update(1)
+        assert "step 1/1, reading" in str(bar) and "done in" not in str(bar)
+
+
 def test_times_are_rounded():
     assert [progress.rounded_time(seconds) for seconds in (0, 44, 89, 91, 3600)] == [
         "10 s",

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -63,6 +64,25 @@ def capture_of(folder, **options):
 def srgb_to_linear(v):
     """By IEC 61966-2-1, in double precision."""
     return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_a_photograph_is_gone_from_memory_when_it_is_resized(kind, monkeypatch):
+    class Pixels(np.ndarray):
+        """Arrays that can have weak references."""
+
+    alive, resized = [], reduction.resized
+    shot = Shot("a", camera(0), encoding="linear" if kind == np.float32 else "srgb")
+    window = reduction.windowed((WIDTH, HEIGHT), (7, 5), (1200, 800), 300)
+
+    def read():
+        image = photographs(1)[0][0].astype(kind).view(Pixels)
+        alive.append(weakref.ref(image))
+        return image
+
+    monkeypatch.setattr(reduction, "resized", lambda *a: alive.append(alive[0]()) or resized(*a))
+    reduction.reduced_image(shot, read, window)
+    assert len(alive) > 2 and all(found is None for found in alive[1:])
 
 
 def test_a_window_is_the_same_camera():

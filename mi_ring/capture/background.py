@@ -17,6 +17,7 @@ WIDTH = 64  #: to which they are reduced [px]
 TILE = 8  #: side of the squares of a photograph that are compared [px]
 SHOWN = 0.3  #: least share of the squares that both of two photographs must show as background with structure
 NEAR = 2  #: pixels around the object that are left out: shadows and blur
+COVERED = 8  #: coverage of a pixel by the object, of 255, from which it is no background
 COARSE = 3.0  #: standard deviation of the blur that is subtracted [px]: light and lens darken corners of any picture
 VARIED = 0.01  #: least standard deviation of what remains in a square, relative to the background's mean
 DARK = 0.02  #: pixels below this share of the background's mean are left out: borders of undistorted photographs
@@ -31,10 +32,10 @@ def stands_still(capture: Capture) -> bool:
     photographs have masks.
     """
     try:
-        difference = background_difference(capture)
+        found = background_difference(capture)
     except InputError:  # a file has gone, of which the fit needs only what is cached
         return False
-    return difference is not None and difference <= STILL
+    return found is not None and found <= STILL
 
 
 def background_difference(capture: Capture) -> float | None:
@@ -58,14 +59,14 @@ def background_difference(capture: Capture) -> float | None:
     least = []
     for own, here, turn in zip(pictures, shown, turns):
         angles = np.degrees(np.arccos(((turns * turn).sum((1, 2)) / 2 - 0.5).clip(-1, 1)))
-        differences = [difference(own, pictures[k], here & shown[k]) for k in np.flatnonzero(angles > TURNED)]
+        differences = [difference_of(own, pictures[k], here & shown[k]) for k in np.flatnonzero(angles > TURNED)]
         told = [value for value in differences if value is not None]
         if len(told) >= FEWEST - 1:
             least.append(min(told))
     return float(np.median(least)) if 2 * len(least) > len(index) else None
 
 
-def difference(first: np.ndarray, second: np.ndarray, shown: np.ndarray) -> float | None:
+def difference_of(first: np.ndarray, second: np.ndarray, shown: np.ndarray) -> float | None:
     """Return how much two pictures of fine structure (h, w) differ, as `background_difference` does.
 
     `shown` (h, w): the pixels to compare. None: too few squares of the pictures have structure.
@@ -93,7 +94,7 @@ def is_seen(capture: Capture, k: int) -> bool:
 def small_background(capture: Capture, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Return photograph `k`, whole and small: (mean of linear R, G, B (h, w), which pixels are background (h, w)).
 
-    The background is what is valid, not near the object and not black.
+    The background is what is valid, not near the object and not black. Raises InputError if a file cannot be read.
     """
     shot = capture.shots[k]
     whole, read, mask, valid = shot.whole, *(getattr(capture, name).readers[k] for name in ("images", "masks", "valid"))
@@ -103,11 +104,13 @@ def small_background(capture: Capture, k: int) -> tuple[np.ndarray, np.ndarray]:
     window = windowed(whole.size, (0, 0), whole.size, WIDTH)
     rgb = observed(whole.through(window), reduced_image(whole, read, window), None, None, 1).rgb[0].numpy()
     size = 2 * NEAR + 1
-    outside = cv2.dilate(reduced_mask(lambda: whole_mask(mask(), shot.window), window), np.ones((size, size))) < 8
+    outside = cv2.dilate(reduced_mask(lambda: whole_mask(mask(), shot.window), window), np.ones((size, size))) < COVERED
     if valid:
         outside &= reduced_valid(valid, window) > 0
     picture = rgb.mean(-1)
-    return picture, outside & (picture > DARK * picture[outside].mean()) if outside.any() else outside
+    if outside.any():
+        outside &= picture > DARK * picture[outside].mean()
+    return picture, outside
 
 
 def fine_structure(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:

@@ -222,7 +222,7 @@ def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
         radiance[first : first + rows] = averaged(linear, blocks)
         if over.any():
             clipped[first : first + rows] = averaged(over, blocks) > 0
-    del image  # it takes more memory than what was made of it
+    image = part = linear = np.empty(0)  # views keep the photograph in memory; it is larger than what was made of it
     over = resized(clipped.astype(np.float32), window) > 0
     return LinearImage(resized(radiance, window).astype(kept), over)
 

@@ -139,10 +139,10 @@ def eroded(mask: np.ndarray) -> np.ndarray:
     return cv2.erode(mask.astype(np.uint8), SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-def usable_pixels(seen: Observation) -> np.ndarray:
+def with_usable_pixels(seen: Observation) -> np.ndarray:
     """Return a photograph as (h, w, 4) float32: linear R, G, B, and 1 where a pixel is usable, otherwise 0.
 
-    A pixel is usable if all pixels up to two pixels away show nothing but the object, not clipped.
+    A pixel is usable if all pixels up to two pixels away show only the object, and none is clipped.
     """
     usable = seen.surely(torch.ones(1)).numpy()[0] & ~seen.clipped[0].numpy().any(-1)
     return cv2.merge([*cv2.split(seen.rgb[0].numpy()), eroded(eroded(usable)).astype(np.float32)])
@@ -152,8 +152,8 @@ def ratios_of(expected: Expected, photograph: np.ndarray, points: Points, triang
               ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Compare a photograph with its prediction. Returns (logarithms of ratios (f, n, 3), which are usable (f, n)).
 
-    A ratio is usable if the pixels of photograph and prediction are. `photograph`: result of `usable_pixels`. `pixels`
-    (V, 2): the vertices in it. `points`: n points in each triangle. `triangles` (f,): those to compare.
+    A ratio is usable if the pixels of photograph and prediction are. `photograph`: result of `with_usable_pixels`.
+    `pixels` (V, 2): the vertices in it. `points`: n points in each triangle. `triangles` (f,): those to compare.
     """
 
     def at_points(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -205,7 +205,7 @@ def sharpened(
         weights = ((normals * away).sum(1) / distance).clip(0, 1) ** SLANT
         weights *= (camera.focal.mean() / resolution / distance) ** 2
         triangles = np.flatnonzero(expected.visible[faces].all(1))
-        photograph, (pixels, _) = usable_pixels(enlarged(before, k, *shots[k])), camera.project(vertices)
+        photograph, (pixels, _) = with_usable_pixels(enlarged(before, k, *shots[k])), camera.project(vertices)
         half, parts = index.index(k) % 2, 1 + len(triangles) * len(ratios.points.shares) // AT_ONCE
         for part in np.array_split(triangles, parts):
             logarithms, usable = ratios_of(expected, photograph, ratios.points, part, pixels)

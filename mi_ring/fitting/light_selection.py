@@ -29,7 +29,8 @@ FITS = {"auto": 8, "lamps": 6, "environment": 2, "turntable": 2}
 LAST = 12  #: last iterations of a coarse fit whose mean error counts
 ALIKE = 1.1  #: ratio of the lights' strengths above which a message is printed
 #: Another light than the scene's is chosen only if its error is below this share of the error with the scene's lights.
-#: An environment fixed in the camera looks much like a flash.
+#: An environment fixed in the camera looks much like a flash; if the background shows that the object turned, it has no
+#: rival that is fixed in the world, and the limit of an environment.
 BETTER = {"environment": 0.9, "turntable": 0.6, "lamps": 0.9}
 MOST = 3  #: lamps
 APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
@@ -62,12 +63,10 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     elif config.light == "lamps":
         found = trials.lamps()
     else:
-        still = stands_still(capture)
-        if still:
-            print("Light: photographs have the same background, so the object has turned before the camera")
-        found = trials.kind(still)
-        if math.isinf(trials.error(found)):
-            found = trials.kind(still=False)
+        if still := stands_still(capture):
+            print("Light: the background is the same from several sides of the object, so the object turned")
+            still = math.isfinite(trials.error(Lighting("turntable")))
+        found = trials.likeliest(still)
         if found.kind in ("environment", "lamps"):  # several lamps are between one and an environment
             found = trials.best(found, trials.lamps())
     if math.isinf(trials.error(found)):
@@ -134,10 +133,10 @@ class CoarseFits:
         """
         return min(lightings, key=self.error)
 
-    def kind(self, still: bool) -> Lighting:
-        """Find the kind of light. Runs coarse fits.
+    def likeliest(self, still: bool) -> Lighting:
+        """Find the lighting that explains the photographs best, with one lamp at most. Runs coarse fits.
 
-        `still`: result of `stands_still`. If it is True, no light is fixed in the world: the object turned.
+        `still`: True if the background stands still. Then no light is fixed in the world: the object turned.
         """
         likely = [Lighting("turntable")]
         if not still:
@@ -146,8 +145,8 @@ class CoarseFits:
                 likely.insert(1, self.brightest(1))
         if not is_unlit(self.capture):
             own = Lighting("capture")
-            share = {one: BETTER["environment" if still else one.kind] for one in likely}
-            likely = [one for one in likely if self.error(one) < share[one] * self.error(own)] or [own]
+            limits = {one: BETTER["environment" if still else one.kind] * self.error(own) for one in likely}
+            likely = [one for one in likely if self.error(one) < limits[one]] or [own]
         return self.best(*likely)
 
     def lamps(self) -> Lighting:

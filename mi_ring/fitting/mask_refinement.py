@@ -72,6 +72,7 @@ def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
     """Return a copy of the capture with new masks. `masks`: a dict from the index of a photograph to its new mask.
 
     A mask is (h, w) uint8, 0 or 1. It is enlarged to the size of the photograph. Other photographs keep their masks.
+    What `capture` has cached with the old masks is removed.
     """
 
     def enlarged(mask: Tensor, size: tuple[int, int]) -> np.ndarray:
@@ -82,6 +83,6 @@ def with_masks(capture: Capture, masks: Mapping[int, Tensor]) -> Capture:
 
     if not masks:
         return capture
-    capture.observations.clear()  # with other masks
+    capture.observations.clear()
     readers = {k: partial(enlarged, mask, capture.shots[k].size) for k, mask in masks.items()}
     return replace(capture, masks=capture.masks.replaced(readers))

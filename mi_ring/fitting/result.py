@@ -30,7 +30,7 @@ def result_of(
     """Collect the results of a fit, from which files are written later. Writes no files, but evaluates the surface.
 
     At the end of a fit with details of colour, the material first gets a texture from the photographs. It gets none if
-    held-out photographs have shown that details are wrong.
+    held-out photographs have shown that details are wrong. Before, the caches of `capture` are emptied.
 
     `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: share of the
     observed light that recent predictions do not explain.

@@ -89,8 +89,8 @@ class Sampler:
     def observe(self, problem: Problem, capture: Capture, batch: Batch) -> Observation:
         """Read this process's photographs of a batch from `capture`, at the scale of the batch.
 
-        At the first iteration of a stage, the cached photographs of the stage before are removed: the next stage needs
-        more memory. Raises InputError in all processes if one process cannot read its files.
+        At the first iteration of a stage, photographs that were cached in the stage before are removed: most stages
+        have another scale. Raises InputError in all processes if one process cannot read its files.
         """
         if 1 < batch.number == batch.stage.first + 1:
             capture.clear_caches()  # what the stage before has used

@@ -226,7 +226,7 @@ class Hull:
 def signed_distance(mask: np.ndarray) -> np.ndarray:
     """Return the distance (H, W) [px] of each pixel's centre from the outline of a mask (H, W), positive inside.
 
-    Without an outline, it is the diagonal of the mask.
+    If all pixels are inside, or all outside, it is that of an outline as far away as the diagonal of the mask.
     """
     inside, most = (mask > 127).astype(np.uint8), math.hypot(*mask.shape)
     within, without = (cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).clip(max=most)

@@ -127,18 +127,18 @@ def read_features(database: Path) -> dict[str, Features]:
 
 
 class Nearest(NamedTuple):
-    """The nearest of m descriptors for each of n others, by scalar products."""
+    """For each of n descriptors the nearest of m others, by scalar products: the larger, the nearer."""
 
-    place: torch.Tensor  #: (n,) which one is nearest; m: none
+    place: torch.Tensor  #: (n,) index of the nearest one; m if there is none
     first: torch.Tensor  #: (n,) its product
     second: torch.Tensor  #: (n,) the product of the second nearest one
-    rest: torch.Tensor  #: (m,) the largest product of each of the m with those to which it is not nearest
+    rest: torch.Tensor  #: (m,) for each of the m, the largest product with those of the n that are nearest to another
 
 
 def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> Nearest:
     """Find for each of n descriptors the nearest of m others.
 
-    `descriptors` (n, 128), `others` (m, 128), uint8.
+    `descriptors` (n, 128), `others` (m, 128), uint8. The products are float32.
     """
     count = len(others)
     # Zeros for the second nearest one if there is only one. Rows of whole cache lines halve the time.
@@ -156,7 +156,7 @@ def nearest(descriptors: torch.Tensor, others: torch.Tensor) -> Nearest:
 
 
 def angles(products: torch.Tensor) -> torch.Tensor:
-    """Return the angles between descriptors, of which the scalar `products` are given."""
+    """Return the angles (k,) [radians] between descriptors, whose scalar products (k,) are given."""
     return torch.acos((products.double() / LENGTH**2).clamp(max=1))
 
 
@@ -164,10 +164,13 @@ def match_descriptors(first: torch.Tensor, second: torch.Tensor) -> tuple[np.nda
     """Find pairs of descriptors that are nearest to each other. Returns (index pairs (k, 2) uint32, ratios (k,)).
 
     `first` (n, 128), `second` (m, 128), uint8. A ratio is the angle between the two, divided by the angle to the second
-    nearest descriptor; of both directions, the larger one. Pairs with a ratio of `LOOSE` or more are left out.
+    nearest descriptor; of both directions, the larger one. Pairs are left out if their angle is above `ANGLE`, if their
+    ratio is `LOOSE` or more, or if two are equally near.
     """
     there, product, other, rest = nearest(first, second)
     rows = (there < len(second)).nonzero()[:, 0]
+    # Back from `second`: of those that chose a descriptor, the nearest one. The others are its rivals. If one that
+    # chose another is nearer, the ratio is above 1, and the pair is left out.
     best = torch.zeros(len(second)).scatter_reduce_(0, there[rows], product[rows], "amax")
     chosen = product[rows] == best[there[rows]]
     rivals = rows[~chosen]

@@ -83,7 +83,7 @@ class Bar(tqdm):
         values = super().format_dict
         if Steps.current and values["prefix"].startswith("step "):
             share = min(1.0, values["n"] / values["total"]) if values["total"] else 0.0
-            if left := Steps.current.left(share):
+            if left := Steps.current.left(share):  # None: unknown; 0: done
                 values["prefix"] = f"{values['prefix'].removesuffix(': ')}, all done in {rounded_time(left)}"
         return values
 
