@@ -94,8 +94,3 @@ def test_mistakes():
         view.camera.to_world[:3, 3] += 3
     with pytest.raises(InputError, match="scene.xml: mask: no point in space is inside all masks"):
         Hull(apart, "scene.xml").ball()
-
-
-@pytest.mark.parametrize(("value", "sign"), [(255, 1), (0, -1)])
-def test_without_an_outline_the_distance_is_the_diagonal(value, sign):
-    np.testing.assert_allclose(signed_distance(np.full((3, 4), value, np.uint8)), sign * 4.5)

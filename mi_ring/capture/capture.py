@@ -220,8 +220,10 @@ class Capture:
 
     def clear_caches(self) -> None:
         """Remove all pixels from the caches, which other captures may share. They are read again when they are used."""
-        for cache in (self.observations, self.images, self.masks, self.valid):
-            cache.clear()
+        self.observations.clear()
+        for pixels in (self.images, self.masks, self.valid):
+            if isinstance(pixels, Pixels):  # not the user's own list
+                pixels.clear()
 
     def exposure(self) -> float:
         """Estimate the mean linear radiance of the object's pixels (1 = full scale of the files) from some photographs.

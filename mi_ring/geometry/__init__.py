@@ -1,4 +1,4 @@
 """Surfaces and cameras as arrays: domains, visual hulls of masks, closed meshes.
 
-May import: numpy, scipy, skimage, cv2, torch, trimesh, gpytoolbox; foreign, system.
+May import: numpy, scipy, torch, trimesh, skimage, gpytoolbox; foreign, system.
 """

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import scipy.ndimage
 import skimage.measure
@@ -93,29 +92,21 @@ class Hull:
         self.what, self.outliers = what, outliers
         self.distances = [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
         origins = np.stack([s.camera.position for s in self.silhouettes])
-        rays = [self.rays(s, outline=True) for s in self.silhouettes]
-        self.center = nearest_point(origins, np.stack([self.middle(s) for s in self.silhouettes]), what)
+        rays = [self.rays(s) for s in self.silhouettes]
+        self.center = nearest_point(origins, np.stack([r.mean(0) / np.linalg.norm(r.mean(0)) for r in rays]), what)
         across = (np.cross(r, self.center - o) for r, o in zip(rays, origins))
         self.reach = max(np.linalg.norm(a, axis=1).max() for a in across)
 
     @staticmethod
-    def rays(silhouette: Silhouette, outline: bool = False) -> np.ndarray:
+    def rays(silhouette: Silhouette) -> np.ndarray:
         """Return the world directions (n, 3), of length 1, of the rays through the object's pixels of a mask.
 
-        `outline`: only those at the outline. Raises InputError if the mask is empty.
+        Raises InputError if the mask is empty.
         """
-        inside = silhouette.mask > 127
-        if outline:
-            inside &= ~scipy.ndimage.binary_erosion(inside)
-        rows, columns = np.nonzero(inside)
+        rows, columns = np.nonzero(silhouette.mask > 127)
         if not len(rows):
             raise InputError(f"{silhouette.name}: mask: is empty, or nearly: no pixels above 127")
         return silhouette.camera.directions(np.stack([columns, rows], 1) + 0.5)
-
-    @staticmethod
-    def middle(silhouette: Silhouette) -> np.ndarray:
-        """Return the world direction (3,), of length 1, of the ray through the middle of the object's pixels."""
-        return silhouette.camera.directions(np.argwhere(silhouette.mask > 127).mean(0)[None, ::-1] + 0.5)[0]
 
     def depth(self, points: Tensor) -> Tensor:
         """Return the approximate signed distance (N,) of points (N, 3) from the hull's surface, positive inside.
@@ -163,7 +154,10 @@ class Hull:
         random, result = np.random.default_rng(0), []
         along = torch.linspace(-self.reach, self.reach, samples)[:, None]
         for silhouette in self.silhouettes if of is None else of:
-            rays = self.rays(silhouette, outline)
+            rays = self.rays(silhouette)
+            if outline:
+                inside = silhouette.mask > 127
+                rays = rays[~scipy.ndimage.binary_erosion(inside)[inside]]
             rays = rays[random.integers(len(rays), size=pixels)]
             origin = silhouette.camera.position
             middle = origin + rays * (rays @ (self.center - origin))[:, None]
@@ -224,11 +218,7 @@ class Hull:
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:
-    """Return the distance (H, W) [px] of each pixel's centre from the outline of a mask (H, W), positive inside.
-
-    If all pixels are inside, or all outside, it is that of an outline as far away as the diagonal of the mask.
-    """
-    inside, most = (mask > 127).astype(np.uint8), math.hypot(*mask.shape)
-    within, without = (cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).clip(max=most)
-                       for part in (inside, 1 - inside))  # fmt: skip
-    return np.where(inside, within - 0.5, 0.5 - without)
+    """Return the distance (H, W) [px] of each pixel's centre from the outline of a mask (H, W), positive inside."""
+    inside = mask > 127
+    edge = scipy.ndimage.distance_transform_edt
+    return np.where(inside, edge(inside) - 0.5, 0.5 - edge(~inside)).astype(np.float32)
