@@ -36,7 +36,7 @@ from mi_ring.system.optional import need
 #: Full scale and bits of cameras whose values may be stored in the low bits of 16.
 LOW_BITS = {1023: 10, 4095: 12, 16383: 14}
 MAX_LABELS = 32  #: largest number of values in a mask of labels; more are a picture
-ROWS = 256  #: of a strip of an image
+ROWS = 256  #: of a strip: large pictures are converted strip by strip, to save memory
 EXR_CHUNK = 256  #: rows of the largest chunk of an OpenEXR file; its reader allocates one for an image of one row, too
 
 Pictures = TypeVar("Pictures", np.ndarray, Tensor)
@@ -100,7 +100,7 @@ def read_image(path: Path, heed: bool = False) -> np.ndarray:
             if bits_of(path) == 16:  # Pillow reduces 16 bits to 8; Mitsuba does not
                 pixels = np.array(mi.Bitmap(str(path)), copy=True)
             elif image.has_transparency_data:  # of palettes, too
-                pixels = np.array(image if image.mode == "LA" else image.convert("RGBA"))
+                pixels = decoded_in_strips(image if image.mode == "LA" else image.convert("RGBA"))
             else:
                 if image.mode not in ("L", "RGB"):
                     image = image.convert("L" if image.mode == "1" else "RGB")

@@ -255,9 +255,11 @@ def test_pixels_are_kept_as_many_as_fit_and_shared(monkeypatch):
     assert [array[0, 0] for array in part] == [5, 3] and read[5:] == [5, 3]
 
 
-def test_pixels_may_be_replaced_by_arrays(small_capture):
+@pytest.mark.parametrize("kind", [Pixels.of, list])
+def test_pixels_may_be_replaced_by_arrays(kind, small_capture):
     scene = loading.load_capture(small_capture)
-    scene = replace(scene, images=Pixels.of([image[..., ::-1].copy() for image in scene.images]))
+    scene = replace(scene, images=kind([image[..., ::-1].copy() for image in scene.images]))
+    scene.clear_caches()
     part = scene.part([3, 1])
     np.testing.assert_array_equal(part.images[0][..., ::-1], loading.load_capture(small_capture).images[3])
     torch.testing.assert_close(part.observe([0])[0], scene.observe([3])[0])

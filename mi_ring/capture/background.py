@@ -1,5 +1,6 @@
 """Tells from the background whether the camera stood still while the object turned in front of it."""
 
+from collections.abc import Callable
 from functools import partial
 
 import cv2
@@ -121,11 +122,11 @@ def fine_structure(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
     """
     weight = shown.astype(np.float32)
 
-    def means(values: np.ndarray, average) -> np.ndarray:  # type: ignore[no-untyped-def]  # a linear function
+    def means(values: np.ndarray, average: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         return average(values * weight) / np.maximum(average(weight), 1e-6)
 
     fine = picture / max(float(picture[shown].mean()) if shown.any() else 0.0, 1e-12)
     fine = fine - means(fine, lambda x: cv2.GaussianBlur(x.astype(np.float32), (0, 0), COARSE))
     for axis in (0, 1):
-        fine = fine - means(fine, lambda x, axis=axis: x.sum(axis, keepdims=True))
+        fine = fine - means(fine, partial(np.sum, axis=axis, keepdims=True))
     return np.where(shown, fine, 0)

@@ -65,6 +65,12 @@ class Capture:
     hulls: dict[Hashable, Hull | None] = field(default_factory=dict, repr=False)
     observations: ObservationCache = field(default_factory=ObservationCache, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        """Convert lists of arrays, which `replace` may be given, to `Pixels`."""
+        for name in ("images", "masks", "valid"):
+            if not isinstance(given := getattr(self, name), Pixels):
+                object.__setattr__(self, name, Pixels.of(given))
+
     @classmethod
     def from_arrays(
         cls, images: Sequence[ArrayLike], masks: Sequence[ArrayLike | None] | None = None, *,
@@ -222,8 +228,7 @@ class Capture:
         """Remove all pixels from the caches, which other captures may share. They are read again when they are used."""
         self.observations.clear()
         for pixels in (self.images, self.masks, self.valid):
-            if isinstance(pixels, Pixels):  # not the user's own list
-                pixels.clear()
+            pixels.clear()
 
     def exposure(self) -> float:
         """Estimate the mean linear radiance of the object's pixels (1 = full scale of the files) from some photographs.

@@ -18,7 +18,7 @@ from mi_ring.capture.brightness_masks import bright, with_masks_by_brightness
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import LinearImage, decode, is_linear, read_mask, read_photograph
 from mi_ring.capture.pixels import Pixels, Reader
-from mi_ring.images import box_filter
+from mi_ring.images import ROWS, box_filter
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.system import cache
 from mi_ring.system.files import digest
@@ -32,7 +32,6 @@ MARGIN = 0.06  #: around the object in a crop, as a share of its size
 WORTH_CROPPING = 0.8  #: a crop must be less wide or less high than this share of the photograph
 SMALL = 512  #: photographs up to this width are never cropped [px]
 COARSE = 512  #: width at which the object is searched in photographs without masks [px]
-ROWS = 256  #: rows of a photograph that are decoded at once: all pixels as floats would take too much memory
 DECODING = 2**30  #: memory for photographs that are decoded at the same time [bytes]
 JPEG_BYTES, PIXEL_BYTES = 8, 40  #: of it for a pixel of a JPEG file, and of any other photograph
 MORE = np.array([[-1], [1]])  #: bounds found in a reduced mask are widened by one of its pixels

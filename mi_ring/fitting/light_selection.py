@@ -76,11 +76,15 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
     rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
     if Lighting("capture") in trials.errors:
-        least = BETTER | ({"turntable": BETTER["environment"]} if still else {})
         rule += ("; those of the scene are kept unless another leaves at most {environment:g} of their error, "
-                 "turntable {turntable:g}").format(**least)  # fmt: skip
+                 "turntable {turntable:g}").format(**limits(still))  # fmt: skip
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
     return found
+
+
+def limits(still: bool) -> dict[str, float]:
+    """Return `BETTER`, as it is for a background that stands still or not."""
+    return BETTER | ({"turntable": BETTER["environment"]} if still else {})
 
 
 class CoarseFits:
@@ -144,9 +148,8 @@ class CoarseFits:
             if math.isfinite(self.error(likely[0])):  # the environment shows where lamps are
                 likely.insert(1, self.brightest(1))
         if not is_unlit(self.capture):
-            own = Lighting("capture")
-            limits = {one: BETTER["environment" if still else one.kind] * self.error(own) for one in likely}
-            likely = [one for one in likely if self.error(one) < limits[one]] or [own]
+            own, shares = Lighting("capture"), limits(still)
+            likely = [one for one in likely if self.error(one) < shares[one.kind] * self.error(own)] or [own]
         return self.best(*likely)
 
     def lamps(self) -> Lighting:
