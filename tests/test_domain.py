@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from mi_ring.errors import InputError
 from mi_ring.geometry.domain import CANDIDATES, Domain, Sphere, closed_domain, samplings
 from mi_ring.geometry.meshes import load_closed_mesh
+from mi_ring.system import cache
 
 MAJOR, MINOR = 1.0, 0.35
 
@@ -54,8 +55,18 @@ def test_points_wander_over_all_of_the_surface_and_faces_stay_faces(torus):
     assert wandering.mean() < 0.5 * at_rest.mean()  # all of the surface is nearer to some vertex than it was
 
 
-def test_beyond_the_finest_level_triangles_are_cut_in_four(torus, monkeypatch):
+def test_a_domains_mesh_is_kept_for_the_next_fit(torus, monkeypatch, tmp_path):
     pytest.importorskip("gpytoolbox")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    points, faces = torus.triangulate(3)
+    monkeypatch.setattr(Domain, "remesh", lambda *_: pytest.fail("is computed again"))
+    again = torus.triangulate(3)
+    assert np.array_equal(again[0], points) and np.array_equal(again[1], faces)
+
+
+def test_beyond_the_finest_level_triangles_are_cut_in_four(torus, monkeypatch, tmp_path):
+    pytest.importorskip("gpytoolbox")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
     monkeypatch.setattr("mi_ring.geometry.domain.REMESHED", 3)
     torus.levels.pop(4, None)
     try:

@@ -9,6 +9,7 @@ from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.geometry.hull import Hull, Silhouette, signed_distance
 from mi_ring.geometry.meshes import genus
+from mi_ring.system import cache
 
 
 def ring(major, minor):
@@ -50,6 +51,28 @@ def test_ball_and_surface_have_the_bodys_place_and_volume():
     assert mesh.is_watertight and genus(mesh) == 0
     assert (3 * mesh.volume / (4 * np.pi)) ** (1 / 3) == pytest.approx(radius, rel=0.02)
     assert np.linalg.norm(mesh.vertices - CENTER, axis=1).min() > 3.7
+
+
+def test_the_surface_is_kept_for_the_next_fit(tmp_path, monkeypatch):
+    """Equal silhouettes give the mesh of the cache folder; another pixel, camera or resolution gives another one."""
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    views = list(silhouettes(ball(4.0)))
+    first = Hull(views, "scene.xml").surface(32)
+    with monkeypatch.context() as known:
+        known.setattr(Hull, "march", lambda *_: pytest.fail("is computed again"))
+        again = Hull(list(silhouettes(ball(4.0))), "elsewhere.xml").surface(32)
+    assert np.array_equal(again.vertices, first.vertices) and np.array_equal(again.faces, first.faces)
+    other = views[3].mask.copy()
+    other[0, 0] = 1  # not even a pixel of the object
+    moved = views[3].camera._replace(centre=views[3].camera.centre + 0.1)
+    Hull([*views[:3], views[3]._replace(mask=other), *views[4:]], "scene.xml").surface(32)
+    Hull([*views[:3], views[3]._replace(camera=moved), *views[4:]], "scene.xml").surface(32)
+    Hull(views, "scene.xml").surface(33)
+    kept = list(cache.cache_folder().iterdir())
+    assert len(kept) == 4
+    for file in kept:
+        file.write_bytes(file.read_bytes()[:-100])  # damaged: it is computed again
+    assert np.array_equal(Hull(views, "scene.xml").surface(32).vertices, first.vertices)
 
 
 def test_a_ring_stays_open():

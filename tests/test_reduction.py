@@ -25,6 +25,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.synthesis.viewpoints import look_at
 from mi_ring.system import cache
+from mi_ring.system.cached_arrays import key_of
 
 WIDTH, HEIGHT = 1300, 900
 BOXES = [(300, 200, 760, 560), (420, 310, 840, 700), (250, 260, 610, 590)]  #: of the object: left, top, right, bottom
@@ -190,7 +191,7 @@ def test_the_second_time_no_photograph_is_decoded(tmp_path, monkeypatch, own_cac
 @pytest.mark.parametrize("byte", [6, 8, 10, 16, 20, 42])
 def test_damage_anywhere_in_a_cached_file_is_noticed(byte, own_cache):
     """A version, encryption, a method, a checksum, a size and a place that no zip file of ours has."""
-    key, mask = reduction.key_of("damaged"), np.arange(6, dtype=np.uint8).reshape(2, 3)
+    key, mask = key_of("damaged"), np.arange(6, dtype=np.uint8).reshape(2, 3)
     image = LinearImage(np.ones((2, 3, 3), np.float16), np.zeros((2, 3, 3), bool))
     content = bytearray(reduction.packed({"images": image, "masks": mask}))
     for entry in re.finditer(b"PK\x01\x02", content):

@@ -1,8 +1,6 @@
 """Makes large photographs small: crops them to the object and averages pixels. The cache folder keeps the results."""
 
 import contextlib
-import hashlib
-import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,11 +19,11 @@ from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.images import ROWS, box_filter
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.system import cache
+from mi_ring.system.cached_arrays import archived, key_of, remembered
 from mi_ring.system.files import digest
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import progress
 
-FORMAT = "2"  #: change it if the content of cached files changes; files of another format are not used
 WIDTH = 512  #: to which photographs are reduced for check, and for fits that do not need more [px]
 HIGHEST = 1.5  #: largest height of a reduced photograph, as a multiple of its largest width
 MARGIN = 0.06  #: around the object in a crop, as a share of its size
@@ -118,27 +116,29 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
     several = {reader: k for k, reader in enumerate(capture.masks.readers) if reader}  # some may share a mask
 
     def bounds(k: int) -> np.ndarray:
-        shot, read = capture.shots[k], capture.masks.readers[k]
+        read = capture.masks.readers[k]
         assert read is not None
         file = source(read) if large else None
-        key = file and key_of("bounds", file)
-        with contextlib.suppress(Exception):  # another process has removed it, or it is damaged in any way
-            if path := key and cache.cached(key):
-                with np.load(path) as stored:  # of a .npz file, checksums are verified
-                    return stored["bounds"]
-        inside = read() > 127  # not kept: it may be large
-        columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
-        found = np.zeros((2, 2), np.int32)
-        if len(rows):
-            found[:] = (columns[0], rows[0]), (columns[-1] + 1, rows[-1] + 1)
-            if shot.window:  # in pixels of the photograph
-                found = np.clip((found + MORE) * shot.window.scale, 0, shot.window.whole).astype(np.int32)
-        if key:
-            cache.store(key, archived({"bounds": found}))
-        return found
+        make = partial(corners, read, capture.shots[k])
+        return remembered(key_of("bounds", file), make)["corners"] if file else make()["corners"]
 
     found = dict(zip(several, in_turn(bounds, capture, list(several.values()), "reading masks")))
     return [found[reader] if reader and found[reader].any() else None for reader in capture.masks.readers]
+
+
+def corners(read: Reader, shot: Shot) -> dict[str, np.ndarray]:
+    """Find the lowest and the highest corner of the object in a mask, (2, 2) int32 [px of the photograph].
+
+    Returns {"corners": array}, which is 0 if the mask is empty.
+    """
+    inside = read() > 127  # not kept: it may be large
+    columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
+    found = np.zeros((2, 2), np.int32)
+    if len(rows):
+        found[:] = (columns[0], rows[0]), (columns[-1] + 1, rows[-1] + 1)
+        if shot.window:  # in pixels of the photograph
+            found = np.clip((found + MORE) * shot.window.scale, 0, shot.window.whole).astype(np.int32)
+    return {"corners": found}
 
 
 def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
@@ -287,11 +287,6 @@ def source(read: Reader | None) -> tuple | None:
     return read.func.__name__, *(file and digest(file) for file in files), files[0] == shot.files.filename
 
 
-def key_of(*parts: Any) -> str:
-    """Return the key in the cache folder for a result that is computed from `parts`. The key is a hash of `parts`."""
-    return hashlib.blake2b(repr((FORMAT, *parts)).encode(), digest_size=16).hexdigest()
-
-
 def packed(arrays: dict[str, Any]) -> memoryview:
     """Convert a reduced photograph and its masks to bytes for the cache folder.
 
@@ -299,13 +294,6 @@ def packed(arrays: dict[str, Any]) -> memoryview:
     """
     image = arrays["images"]
     return archived(arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped)})
-
-
-def archived(arrays: dict[str, np.ndarray]) -> memoryview:
-    """Return the bytes of a .npz file of arrays by name."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # mypy takes the arrays for options
-    return buffer.getbuffer()
 
 
 def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | LinearImage:

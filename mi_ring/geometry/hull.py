@@ -1,7 +1,10 @@
 """The visual hull of masks. It contains all points whose projections are inside the masks. A fit may start from it."""
 
+import functools
+import itertools
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +17,7 @@ from torch.nn import functional as F
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera, distortion_factor, nearest_point
+from mi_ring.system.cached_arrays import key_of, remembered
 
 MIN_SHARE = 0.25  #: a point is outside if a smaller share of the photographs shows it
 MAX_MASKS, MAX_WIDTH = 128, 512  #: limits of the number of silhouettes and their width [px]; more hardly help
@@ -90,12 +94,16 @@ class Hull:
     def __init__(self, silhouettes: Sequence[Silhouette], what: str, outliers: float = 0.02) -> None:
         self.silhouettes = subsample(silhouettes, MAX_MASKS, MAX_WIDTH)
         self.what, self.outliers = what, outliers
-        self.distances = [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
         origins = np.stack([s.camera.position for s in self.silhouettes])
         rays = [self.rays(s) for s in self.silhouettes]
         self.center = nearest_point(origins, np.stack([r.mean(0) / np.linalg.norm(r.mean(0)) for r in rays]), what)
         across = (np.cross(r, self.center - o) for r, o in zip(rays, origins))
         self.reach = max(np.linalg.norm(a, axis=1).max() for a in across)
+
+    @functools.cached_property
+    def distances(self) -> list[Tensor]:
+        """For each silhouette, the `signed_distance` (H, W) from its outline [px]."""
+        return [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
 
     @staticmethod
     def rays(silhouette: Silhouette) -> np.ndarray:
@@ -194,8 +202,16 @@ class Hull:
     def surface(self, resolution: int = 128) -> trimesh.Trimesh:
         """Return the closed surface of the hull's largest piece, a mesh in scene units. It is found by marching cubes.
 
-        `resolution`: number of grid cells along the longest side. Raises NoHull if the hull is empty.
+        `resolution`: number of grid cells along the longest side. The cache folder keeps the mesh. Raises NoHull if the
+        hull is empty.
         """
+        views = [(s.mask, s.valid, s.frame, *s.camera) for s in self.silhouettes]
+        key = key_of("hull", Path(__file__).read_bytes(), self.outliers, resolution, *itertools.chain(*views))
+        mesh = remembered(key, lambda: self.march(resolution))
+        return trimesh.Trimesh(mesh["vertices"], mesh["faces"], process=False)
+
+    def march(self, resolution: int) -> dict[str, np.ndarray]:
+        """Compute the mesh of `surface` by marching cubes: "vertices" (V, 3) and "faces" (F, 3)."""
         low, high = self.center - self.reach, self.center + self.reach
         spacing = 2 * self.reach / 64
         points, shape = self.grid(low, high, spacing)
@@ -214,7 +230,8 @@ class Hull:
         self.require(int((field > 0).sum()))
         vertices, faces, _, _ = skimage.measure.marching_cubes(field, 0.0, gradient_direction="ascent")
         mesh = trimesh.Trimesh((vertices - 1) * fine + low, faces)
-        return max(mesh.split(only_watertight=False), key=lambda piece: piece.area)
+        largest = max(mesh.split(only_watertight=False), key=lambda piece: piece.area)
+        return {"vertices": largest.vertices, "faces": largest.faces}
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:

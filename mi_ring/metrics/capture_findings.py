@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import ndimage, stats
+import scipy  # its part stats, which takes half a second to import, is imported when it is used
+from scipy import ndimage
 
 from mi_ring.capture.brightness_masks import dark_threshold
 from mi_ring.capture.capture import Capture
@@ -172,7 +173,7 @@ def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
     if len(received) < 12 or received.max() < 1.5 * received.min():
         return 0.0
     level = brightness * received
-    _, _, _, steepest = stats.theilslopes(level, received)
+    _, _, _, steepest = scipy.stats.theilslopes(level, received)
     rest = np.median(level - steepest * received)
     return float(max(0.0, rest / np.median(level)))
 

@@ -3,13 +3,11 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
 from mi_ring.output.ambiguity import ambiguity
-from mi_ring.output.svg import svg_uri
+from mi_ring.output.svg import new_figure, svg_uri
 from mi_ring.rendering.spherical_harmonics import PER_FRAME, room_envmap
 from mi_ring.scene.assembly import lamp_lights
 
@@ -114,7 +112,7 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
     light = after.photographs.room if after.photographs.dark else None
     told = max(moved) > VISIBLE or len(power) or light is not None  # otherwise there is no second chart
-    figure = Figure(figsize=(9 if told else 4.5, 3.4), layout="constrained")
+    figure = new_figure(9 if told else 4.5, 3.4)
     plan, *others = figure.subplots(1, 2 if told else 1, squeeze=False)[0]
     up = before.up
     right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
@@ -146,10 +144,11 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
         return svg_uri(figure)
 
 
-def draw_plan(axes: Axes, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
+def draw_plan(axes: Any, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
     """Draw cameras, viewing directions and lights of a capture into `axes`, projected orthogonally to a plane.
 
-    `plane` (2, 3): two orthogonal unit vectors that span the plane. `colour`: of all marks. `label`: for the legend.
+    `axes`: a matplotlib.axes.Axes. `plane` (2, 3): two orthogonal unit vectors that span it. `colour`: of all marks.
+    `label`: for the legend.
     """
     poses = np.stack([shot.camera.to_world for shot in capture.shots])
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T

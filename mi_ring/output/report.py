@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
-from matplotlib.figure import Figure
 from PIL import Image
 from scipy import ndimage
 from skimage.measure import block_reduce
@@ -25,7 +24,7 @@ from mi_ring.metrics.image_errors import comparable
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.calibration_panel import held_out_text, panel
 from mi_ring.output.fit_result import FitResult
-from mi_ring.output.svg import svg_uri
+from mi_ring.output.svg import new_figure, svg_uri
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 from mi_ring.system.command import scene_name
@@ -329,7 +328,7 @@ def data_uri(picture: np.ndarray) -> str:
 
 def loss_curve(result: FitResult) -> str:
     """Draw the loss and its weighted terms over the iterations as an SVG data URI."""
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    figure = new_figure(9, 3.2)
     axes = figure.subplots()
     for term in ("loss", *result.terms):
         points = []

@@ -39,7 +39,7 @@ def cached(key: str) -> Path | None:
 def store(key: str, content: bytes | memoryview) -> bool:
     """Write a file into the cache. Returns True if it was written, False if that failed.
 
-    `key`: name of the file, 32 hexadecimal digits, usually a hash of what the content was computed from.
+    `key`: 32 hexadecimal digits, the name of the file.
     """
     from mi_ring.system.files import write_file  # which needs torch; the rest of this module does not
 
