@@ -198,18 +198,37 @@ def test_ambiguous_features_match_where_the_geometry_says(plane):
     second[wrong] = random.uniform([0, 0], [800, 600], (len(wrong), 2))
     elsewhere = random.uniform([0, 0], [800, 600], (400, 2))
     images = [
-        matching.Features(k, camera, points, torch.tensor(descriptors))
-        for k, points, descriptors in (
-            (1, first, own), (2, np.concatenate([second, elsewhere]), np.concatenate([other, rivals])),
+        matching.Features(k, camera, before, points, torch.tensor(descriptors))
+        for k, before, points, descriptors in (
+            (1, 7, first, own), (2, 3, np.concatenate([second, elsewhere]), np.concatenate([other, rivals])),
         )
     ]  # fmt: skip
-    found = matching.match_pair(*images).inlier_matches.astype(int)
+    found = matching.match_pair(*images).inlier_matches.astype(int) - [7, 3]  # numbers in the database
     _, ratios = matching.match_descriptors(*(image.descriptors for image in images))
     right = (found[:, 0] == found[:, 1]) & ~np.isin(found[:, 0], wrong)
     assert right.sum() > 1.3 * (ratios < matching.RATIO).sum()
     assert right.mean() > 0.95
-    back = matching.match_pair(*images[::-1]).inlier_matches[:, ::-1].tolist()
-    assert len(set(map(tuple, back)) & set(map(tuple, found))) > 0.95 * len(found)
+    back = matching.match_pair(*images[::-1]).inlier_matches[:, ::-1].astype(int) - [7, 3]
+    assert len(set(map(tuple, back.tolist())) & set(map(tuple, found.tolist()))) > 0.95 * len(found)
+
+
+def test_the_largest_features_are_matched(folder, monkeypatch):
+    """No more than `FEATURES`; matches are numbered as in the database, so their places agree with a homography."""
+    pictures, work = find_pictures(folder), folder / "work"
+    matching.find_features(pictures, work, silent)
+    monkeypatch.setattr(matching, "FEATURES", 200)
+    features = matching.read_features(work / "database.db")
+    first = features[matching.grey_file(pictures[0])]
+    with matching.pycolmap.Database.open(work / "database.db") as opened:
+        every = opened.read_keypoints(first.image)
+    sizes = np.sqrt(np.abs(every[:, 2] * every[:, 5] - every[:, 3] * every[:, 4]))
+    assert len(every) > 300 and len(first.points) == 200 and np.array_equal(every[first.first :, :2], first.points)
+    assert np.median(sizes[first.first :]) > 1.2 * np.median(sizes[: first.first])
+    list(matching.match_pairs([tuple(map(matching.grey_file, pictures[:2]))], features, work))
+    ((_, _, one, other),) = matching.read_matches(work / "database.db")
+    assert len(one) > 40
+    homography, agreeing = cv2.findHomography(one, other, cv2.RANSAC, 4.0)
+    assert homography is not None and agreeing.mean() > 0.9
 
 
 def test_an_interrupted_run_loses_at_most_a_batch(folder, monkeypatch):

@@ -105,25 +105,31 @@ def camera_ids(database: Path) -> dict[str, int]:
 
 
 class Features(NamedTuple):
-    """The features of an image in COLMAP's database."""
+    """The features of an image in COLMAP's database, the `FEATURES` largest of them."""
 
     image: int  #: its number there
     camera: Any  #: pycolmap's camera
+    first: int  #: index there of the first of these features; smaller ones are before it
     points: np.ndarray  #: (n, 2) where they are [px]
     descriptors: torch.Tensor  #: (n, 128) uint8
 
 
 def read_features(database: Path) -> dict[str, Features]:
-    """Read the features of all images in a COLMAP database. Returns them by file name."""
+    """Read the features of all images in a COLMAP database. Returns them by file name.
+
+    COLMAP limits the number of places; a place may have features of several orientations. It sorts them by size.
+    """
+    found = {}
     with pycolmap.Database.open(database) as opened:
         cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        return {
-            image.name: Features(
-                image.image_id, cameras[image.camera_id], opened.read_keypoints(image.image_id)[:, :2].astype(float),
-                torch.tensor(opened.read_descriptors(image.image_id).data).reshape(-1, 128),
+        for image in opened.read_all_images():
+            points = opened.read_keypoints(image.image_id)[:, :2].astype(float)
+            descriptors = torch.tensor(opened.read_descriptors(image.image_id).data).reshape(-1, 128)
+            first = max(0, len(points) - FEATURES)
+            found[image.name] = Features(
+                image.image_id, cameras[image.camera_id], first, points[first:], descriptors[first:]
             )
-            for image in opened.read_all_images()
-        }  # fmt: skip
+    return found
 
 
 class Nearest(NamedTuple):
@@ -192,19 +198,28 @@ def match_pair(first: Features, second: Features) -> Any:
     wrong, even with a ratio near 1, for example for two similar features of an object.
     """
     matches, ratios = match_descriptors(first.descriptors, second.descriptors)
+    likely = matches[ratios < RATIO]
     geometry = pycolmap.estimate_two_view_geometry(
-        first.camera, first.points, second.camera, second.points, matches[ratios < RATIO], verification()
+        first.camera, first.points, second.camera, second.points, likely, verification(len(likely))
     )
     if len(geometry.inlier_matches):
         a, b = (own.points[column] for own, column in zip((first, second), matches.T))
-        geometry.inlier_matches = matches[distances(geometry, a, b) <= FAR]
+        agreeing = matches[distances(geometry, a, b) <= FAR]
+        geometry.inlier_matches = agreeing + np.array([first.first, second.first], np.uint32)
     return geometry
 
 
-def verification() -> Any:
-    """Return options for COLMAP's geometric verification, with a fixed random seed, so that results can be repeated."""
+def verification(matches: int = 0) -> Any:
+    """Return options for COLMAP's geometric verification, with a fixed random seed, so that results can be repeated.
+
+    `matches`: of the pair, if it is known. It has no more trials than are needed to find a geometry with the least
+    number of inliers among them. Pairs that do not overlap, with their few matches, would take the longest otherwise.
+    """
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
+    if matches:
+        least = options.min_num_inliers / matches
+        options.ransac.min_inlier_ratio = min(1.0, max(options.ransac.min_inlier_ratio, least))
     return options
 
 
