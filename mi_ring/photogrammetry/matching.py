@@ -31,6 +31,7 @@ LENGTH = 512.0  #: of a descriptor
 #: Largest angle between the descriptors of a match [radians], also as a share of the angle to the second nearest one:
 #: RATIO to find the geometry of two photographs, LOOSE for matches that agree with it.
 ANGLE, RATIO, LOOSE = 0.7, 0.8, 0.95
+TRIALS = 1.5  #: of geometries of a pair, relative to those that suffice for its inliers with a probability of 99.9 %
 FAR = 4.0  #: the largest distance of a match that agrees [px]
 LINE = 16  #: floats in a line of the processor's cache
 BLOCK = 512  #: rows of a matrix of products that is computed at a time, so that it stays in the processor's cache
@@ -220,6 +221,7 @@ def verification(matches: int = 0) -> Any:
     if matches:
         least = options.min_num_inliers / matches
         options.ransac.min_inlier_ratio = min(1.0, max(options.ransac.min_inlier_ratio, least))
+        options.ransac.dyn_num_trials_multiplier = TRIALS
     return options
 
 
