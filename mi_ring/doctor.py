@@ -26,8 +26,8 @@ class DoctorConfig:
     """Say what mi_ring lacks on this machine and how to get it. The exit status is 1 if a fit cannot run."""
 
     empty_cache: bool = False
-    """Remove the reduced copies of photographs that fits and checks keep in the cache folder, to free disk space.
-    Your photographs stay. The next fit of a capture makes the copies again and takes longer."""
+    """Remove the reduced photographs and surfaces that fits and checks keep in the cache folder, to free disk space.
+    Your photographs stay. The next fit of a capture makes these files again and takes longer."""
 
 
 class Finding(NamedTuple):
