@@ -1,6 +1,8 @@
 """Textures from photographs at their own size, which may be larger than those of the fit."""
 
+import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -13,7 +15,9 @@ from mi_ring.capture.observation import Observation
 from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.fitting import fine_texture
+from mi_ring.fitting.config import Config
 from mi_ring.fitting.surface_ratios import LowPass, Points, Ratios, bilinear
+from mi_ring.fitting.validation import texture_helps
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.nets.brdf_net import BRDFNet, Parameter
@@ -155,6 +159,19 @@ def test_pictures_and_maps_show_it(sharp, print_scene):
     assert textured < 0.06 < 0.2 < smooth
     np.testing.assert_array_equal(pictures[1], pictures[0])
     np.testing.assert_allclose((diffuse / MATTE)[inside], pictures[0][inside] / plain[inside], rtol=0.1)
+
+
+def test_held_out_photographs_decide(sharp, print_scene):
+    """The texture stays; the opposite of it, as of photographs in wrong places, does not. Nothing is said by none."""
+    capture, ring = load_capture(print_scene, width=160), pale_ball()
+    wrong = copy.deepcopy(sharp)
+    wrong.brdf_net.grid.values[0].data.neg_()
+    surface = Surface(capture.scene, capture.shape, ring)
+    problem = SimpleNamespace(held_out=np.array([1, 6]), config=Config(widths=(40, 80, 160)))
+    assert texture_helps(problem, capture, surface, ring, sharp)
+    assert not texture_helps(problem, capture, surface, ring, wrong)
+    none = SimpleNamespace(held_out=np.array([], int), config=problem.config)
+    assert texture_helps(none, capture, surface, ring, wrong)
 
 
 def test_it_is_as_strong_at_outlines(print_scene):

@@ -16,6 +16,7 @@ from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.fitting.summary import summary
+from mi_ring.fitting.validation import texture_helps
 from mi_ring.output.fit_result import FitResult
 from mi_ring.scene.assembly import lamp_lights
 from mi_ring.system.machine import release_memory
@@ -30,7 +31,7 @@ def result_of(
     """Collect the results of a fit, from which files are written later. Writes no files, but evaluates the surface.
 
     At the end of a fit with details of colour, the material first gets a texture from the photographs. It gets none if
-    held-out photographs have shown that details are wrong. Before, the caches of `capture` are emptied.
+    held-out photographs show that details or the texture are wrong. Before, the caches of `capture` are emptied.
 
     `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: share of the
     observed light that recent predictions do not explain.
@@ -46,8 +47,12 @@ def result_of(
         capture.clear_caches()
         release_memory()  # of the last stage
         try:
-            shown = renderer.show(model, ring.subdivisions)
-            ring = sharpened(capture, refined, shown, ring, problem.fitted, max(problem.config.widths))
+            surface = renderer.show(model, ring.subdivisions)
+            sharp = sharpened(capture, refined, surface, ring, problem.fitted, max(problem.config.widths))
+            if sharp is ring or texture_helps(problem, refined, surface, ring, sharp):
+                ring = sharp
+            else:
+                print("The texture is left out: it does not improve the prediction of held-out photographs")
         except InputError as error:  # a file has gone; all else can be saved
             print(f"There is no texture: {error}")
     return FitResult(

@@ -1,4 +1,4 @@
-"""Validation on held-out photographs: does the refined calibration predict them better than the given calibration?
+"""Validation on held-out photographs: do details, a texture and the refined calibration predict them better?
 
 Surface and material are not fitted again with the given calibration. So the comparison favours the refined one.
 """
@@ -11,37 +11,63 @@ import numpy as np
 import torch
 
 from mi_ring.calibration.unknowns import UNKNOWNS
+from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
+from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering import prediction
+from mi_ring.rendering.surface import Surface
 
 COMPARED_WIDTH, SPP, MOST = 256, 4, 16  #: largest width [px], samples per pixel, and number of the pictures compared
 #: Options that are refined for single photographs, and so are unknown of those that are held out.
 PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per == "photograph"}
 
 
-def unexplained(problem: Problem, model: Model, renderer: Renderer, level: int) -> float:
+def unexplained(problem: Problem, refined: Capture, surface: Surface, indirect: bool, width: int) -> float:
     """Render held-out photographs. Returns the mean absolute error on the object, divided by the mean observed value.
 
-    Each prediction is first multiplied by the factor that fits its photograph best. `level`: level of the mesh. Returns
-    NaN if no held-out photograph shows the object.
+    Each prediction is first multiplied by the factor that fits its photograph best. `refined`: the capture with the
+    calibration to use. `surface`: shows the object. `indirect`: True renders interreflection. `width`: largest width of
+    the pictures compared [px]. Returns NaN if no held-out photograph shows the object.
     """
-    capture, shares = model.calibrated(problem.capture), []
-    surface = renderer.show(model, level)
+    shares = []
     for k in problem.held_out[:: -(-len(problem.held_out) // MOST)]:
-        shot = capture.shots[k]
-        scale = -(-shot.size[0] // COMPARED_WIDTH)
-        rgb, coverage = prediction.draw(surface, capture.photograph(k, scale), SPP, shadows=capture.shadows,
-                                    indirect=model.ring.indirect)  # fmt: skip
-        seen = capture.observe([k], scale)
+        shot = refined.shots[k]
+        scale = -(-shot.size[0] // width)
+        rgb, coverage = prediction.draw(surface, refined.photograph(k, scale), SPP, shadows=refined.shadows,
+                                    indirect=indirect)  # fmt: skip
+        seen = refined.observe([k], scale)
         inside = seen.surely(coverage) & ~seen.clipped.any(-1)
         observed, predicted = (recorded(linear[0].numpy(), shot, scale)[inside[0]] for linear in (seen.rgb, rgb))
         if len(observed):
             factor = (observed * predicted).sum() / max((predicted**2).sum(), 1e-12)
             shares.append(float(np.abs(factor * predicted - observed).sum() / observed.sum()))
     return float(np.mean(shares)) if shares else np.nan
+
+
+def texture_helps(
+    problem: Problem, refined: Capture, surface: Surface, ring: FittedObject, sharp: FittedObject
+) -> bool:
+    """Test whether held-out photographs are predicted better with a texture. Returns True if none shows the object.
+
+    `refined`: the capture after calibration. `ring`, `sharp`: the object without and with the texture. `surface` shows
+    `sharp` afterwards.
+    """
+    if not len(problem.held_out):
+        return True
+    without, with_texture = (
+        unexplained(problem, refined, shown(surface, one), ring.indirect, max(problem.config.widths))
+        for one in (ring, sharp)
+    )
+    return not with_texture >= without
+
+
+def shown(surface: Surface, ring: FittedObject) -> Surface:
+    """Let a surface show an object at its finest level. Returns the surface."""
+    surface.show(ring, *ring.domain.sample(ring.subdivisions))
+    return surface
 
 
 @torch.no_grad()
@@ -59,7 +85,8 @@ def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> 
 
     def now() -> float:
         model.update_albedo()
-        return unexplained(problem, model, renderer, level)
+        surface, capture = renderer.show(model, level), model.calibrated(problem.capture)
+        return unexplained(problem, capture, surface, model.ring.indirect, COMPARED_WIDTH)
 
     found = now()
     if math.isnan(found):
