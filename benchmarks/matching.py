@@ -1,5 +1,7 @@
 """Compare our matcher with COLMAP's on the same features: matches, time, and the cameras that come of them.
 
+COLMAP's matcher gets all features that COLMAP finds, ours the largest --features of them.
+
     python benchmarks/matching.py PHOTOS OUT [--truth DIR] [--matchers NAME…] [--first N] [--timed N]
         [--longest 1600] [--features 4096]
 
@@ -32,7 +34,7 @@ from trimesh.registration import procrustes
 from mi_ring.geometry.camera import nearest_point
 from mi_ring.importers.formats import detect
 from mi_ring.importers.frames import frames_of
-from mi_ring.photogrammetry import matching
+from mi_ring.photogrammetry import image_features, matching
 from mi_ring.photogrammetry.bundle_adjustment import adjust
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 from mi_ring.photogrammetry.structure_from_motion import reconstruct, to_sparse_model
@@ -45,10 +47,10 @@ MATCHERS = "guided", "library", "products", "chosen"
 def match(name: str, pairs: Pairs, folder: Path) -> None:
     """Match pairs of files with one of the `MATCHERS`."""
     if name in ("products", "chosen"):
-        features = matching.read_features(folder / "database.db")
+        features = image_features.read_features(folder / "database.db")
         list(progress(matching.match_pairs(pairs, features, folder), name, len(pairs)))
         return
-    for batch in progress(list(matching.batches(pairs, matching.BATCH)), name):
+    for batch in progress(list(image_features.batches(pairs, matching.BATCH)), name):
         matching.match_by_library(batch, folder, name == "guided")
 
 
@@ -94,18 +96,18 @@ def main() -> None:
     parser.add_argument("--matchers", nargs="+", choices=MATCHERS, default=MATCHERS)
     parser.add_argument("--first", type=int)
     parser.add_argument("--timed", type=int)
-    parser.add_argument("--longest", type=int, default=matching.LONGEST)
-    parser.add_argument("--features", type=int, default=matching.FEATURES)
+    parser.add_argument("--longest", type=int, default=image_features.LONGEST)
+    parser.add_argument("--features", type=int, default=image_features.FEATURES)
     options = parser.parse_args()
-    matching.LONGEST, matching.FEATURES = options.longest, options.features
+    image_features.LONGEST, image_features.FEATURES = options.longest, options.features
     matching.pycolmap.logging.minloglevel = matching.pycolmap.logging.FATAL
     pictures = find_pictures(options.photos)[: options.first]
     features = options.out / f"features_{options.longest}_{options.features}"
     (features / "grey").mkdir(parents=True, exist_ok=True)
-    spent, passed = clocked(lambda: matching.find_features(pictures, features, progress))
+    spent, passed = clocked(lambda: image_features.find_features(pictures, features, progress))
     true = {f.image.stem: f.pose for f in frames_of(detect(options.truth))} if options.truth else {}
-    files = [matching.grey_file(picture) for picture in pictures]
-    known = matching.read_features(features / "database.db")
+    files = [image_features.grey_file(picture) for picture in pictures]
+    known = image_features.read_features(features / "database.db")
     descriptors = [known[file].descriptors for file in files]
     rows = []
     for name in options.matchers:

@@ -27,7 +27,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    folder = tempfile.TemporaryDirectory(prefix="mi_ring-cache-")  # reduced photographs, instead of the user's cache
+    folder = tempfile.TemporaryDirectory(prefix="mi_ring-cache-")  # instead of the user's
     os.environ["MI_RING_CACHE"] = folder.name
     config.add_cleanup(folder.cleanup)
     if variant := config.getoption("--variant"):

@@ -17,13 +17,17 @@ from mi_ring.fitting import session
 from mi_ring.fitting.fit import Fit
 from mi_ring.geometry import domain
 from mi_ring.output import results
-from mi_ring.system import files, machine
+from mi_ring.system import cache, files, machine
 
 
 @pytest.mark.parametrize(("table", "start", "stop"), [  # which is in the second stage
     (False, [*QUICK, "--no-indirect"], 4), (True, SPHERE, 6),
 ])  # fmt: skip
-def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(broken_capture, tmp_path, table, start, stop):
+def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(
+    broken_capture, tmp_path, monkeypatch, table, start, stop
+):
+    """Also with an empty cache folder, and with one that has the start surface of the other fit."""
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
     small_capture, edit = broken_capture
     if table:
         edit("</scene>", TABLE)

@@ -75,7 +75,10 @@ def test_beyond_the_finest_level_triangles_are_cut_in_four(torus, monkeypatch, t
         torus.levels.pop(4)
 
 
-def test_domains_of_one_surface_share_its_samplings_which_are_the_same_when_they_are_made_anew(torus):
+def test_domains_of_one_surface_share_its_samplings_which_are_the_same_when_they_are_made_anew(
+    torus, monkeypatch, tmp_path
+):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
     again, other = Domain(torus.points, torus.faces), Domain(1.001 * torus.points, torus.faces)
     points, faces = again.sample(3)
     assert points is torus.sample(3)[0]

@@ -80,7 +80,7 @@ def photographs(tmp_path_factory, speckles):
     """And their true masks in a folder within."""
     folder = tmp_path_factory.mktemp("photographs")
     (folder / "masks").mkdir()
-    for k, pose in enumerate(walk(14)):
+    for k, pose in enumerate(walk(16)):
         name = f"# 2026 IMG ({k:02}).png"  # as messengers and file managers call them
         Image.fromarray(rendered(pose, speckles)).save(folder / name)
         mask = np.isfinite(hit_ellipsoid(LENS.camera(pose))[0]).reshape(SIZE[::-1])
@@ -138,7 +138,7 @@ def test_a_process_that_is_killed_at_any_stage_goes_on(photographs, tmp_path):
     assert json.loads(ended.stdout.splitlines()[-1]) == [[stage, -9] for stage, _ in STAGES]
     photos.main(arguments)
     capture = load_capture(tmp_path / "capture/scene.xml")
-    assert len(capture) == 14 and (tmp_path / "capture/check.png").exists()
+    assert len(capture) == 16 and (tmp_path / "capture/check.png").exists()
     found = [(mask > 127).sum() for mask in capture.masks]
     true = [(np.array(Image.open(file)) > 0).sum() for file in sorted((photographs / "masks").iterdir())]
     np.testing.assert_allclose(found, true, rtol=0.02)

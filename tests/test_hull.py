@@ -54,25 +54,38 @@ def test_ball_and_surface_have_the_bodys_place_and_volume():
 
 
 def test_the_surface_is_kept_for_the_next_fit(tmp_path, monkeypatch):
-    """Equal silhouettes give the mesh of the cache folder; another pixel, camera or resolution gives another one."""
+    """Equal silhouettes give the mesh of the cache folder, unless it is damaged."""
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
-    views = list(silhouettes(ball(4.0)))
-    first = Hull(views, "scene.xml").surface(32)
+    first = Hull(list(silhouettes(ball(4.0))), "scene.xml").surface(32)
     with monkeypatch.context() as known:
         known.setattr(Hull, "march", lambda *_: pytest.fail("is computed again"))
         again = Hull(list(silhouettes(ball(4.0))), "elsewhere.xml").surface(32)
     assert np.array_equal(again.vertices, first.vertices) and np.array_equal(again.faces, first.faces)
-    other = views[3].mask.copy()
-    other[0, 0] = 1  # not even a pixel of the object
-    moved = views[3].camera._replace(centre=views[3].camera.centre + 0.1)
-    Hull([*views[:3], views[3]._replace(mask=other), *views[4:]], "scene.xml").surface(32)
-    Hull([*views[:3], views[3]._replace(camera=moved), *views[4:]], "scene.xml").surface(32)
-    Hull(views, "scene.xml").surface(33)
-    kept = list(cache.cache_folder().iterdir())
-    assert len(kept) == 4
-    for file in kept:
-        file.write_bytes(file.read_bytes()[:-100])  # damaged: it is computed again
-    assert np.array_equal(Hull(views, "scene.xml").surface(32).vertices, first.vertices)
+    (file,) = cache.cache_folder().iterdir()
+    content = file.read_bytes()
+    shape = f"({len(first.faces)}, 3)".encode()
+    for damaged in (content[:-100], b"", content.replace(shape, shape.replace(b"3)", b"2)"))):
+        assert damaged != content
+        file.write_bytes(damaged)
+        made = Hull(list(silhouettes(ball(4.0))), "scene.xml").surface(32)
+        assert np.array_equal(made.vertices, first.vertices) and np.array_equal(made.faces, first.faces)
+
+
+@pytest.mark.parametrize("part", ["mask", "valid", "frame", "centre", "distortion", "outliers", "resolution"])
+def test_another_hull_is_not_that_of_the_cache_folder(tmp_path, monkeypatch, part):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    views, outliers, resolution = list(silhouettes(ball(4.0))), 0.02, 32
+    Hull(views, "scene.xml", outliers).surface(resolution)
+    mask, camera = views[3].mask.copy(), views[3].camera
+    mask[0, 0] = 1  # not even a pixel of the object
+    others = {
+        "mask": {"mask": mask}, "valid": {"valid": np.full_like(mask, 255)},
+        "frame": {"frame": np.array([[0.0, 0.0], [W, H]])}, "distortion": {"camera": camera._replace(distortion=0.1)},
+        "centre": {"camera": camera._replace(centre=camera.centre + 1)},
+    }  # fmt: skip
+    views[3] = views[3]._replace(**others.get(part, {}))
+    Hull(views, "scene.xml", outliers + 0.03 * (part == "outliers")).surface(resolution + (part == "resolution"))
+    assert len(list(cache.cache_folder().iterdir())) == 2
 
 
 def test_a_ring_stays_open():

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mi_ring.errors import InputError
-from mi_ring.photogrammetry import matching
+from mi_ring.photogrammetry import image_features, matching
 from mi_ring.photogrammetry.folder import Picture, find_pictures
 
 
@@ -88,7 +88,7 @@ def test_of_a_ring_of_many_photographs_all_neighbours_are_matched():
 def folder(tmp_path, monkeypatch):
     """Photographs of a plane with blots, each turned and moved, one of another size, one without any feature."""
     pytest.importorskip("pycolmap").logging.minloglevel = 2
-    monkeypatch.setattr(matching, "FEATURES", 500)
+    monkeypatch.setattr(image_features, "FEATURES", 500)
     random = np.random.default_rng(0)
     layers = [cv2.GaussianBlur(random.normal(size=(500, 500)), (0, 0), sigma) * sigma for sigma in (1.5, 4, 10)]
     page = np.where(sum(layers) > 0, 200, 30).astype(np.uint8)
@@ -109,7 +109,7 @@ def content(database):
         pairs = {frozenset((names[a], names[b])): (a, b) for a, b in itertools.combinations(names, 2)}
         verified = {pair: opened.read_two_view_geometry(*ids).inlier_matches.tolist() for pair, ids in pairs.items()
                     if opened.exists_two_view_geometry(*ids)}  # fmt: skip
-    return matching.camera_ids(database), verified
+    return image_features.camera_ids(database), verified
 
 
 def test_photographs_that_show_the_same_match(folder, monkeypatch):
@@ -120,15 +120,15 @@ def test_photographs_that_show_the_same_match(folder, monkeypatch):
         shown.append((what, total))
         return things
 
-    matching.find_features(pictures, folder / "work", progress)
+    image_features.find_features(pictures, folder / "work", progress)
     matching.match_features(pictures, folder / "work", progress)
     assert shown == [("features", 8), ("matching", 28)]
     cameras, verified = content(folder / "work/database.db")
     assert len(verified) == 28
-    blank = matching.grey_file(pictures[3])
+    blank = image_features.grey_file(pictures[3])
     assert all((not found) == (blank in pair) for pair, found in verified.items())
     assert min(len(found) for pair, found in verified.items() if blank not in pair) > 40
-    files = [matching.grey_file(picture) for picture in pictures]
+    files = [image_features.grey_file(picture) for picture in pictures]
     assert len({cameras[file] for file in files[:6]}) == len({cameras[file] for file in files[6:]}) == 1
     assert cameras[files[0]] != cameras[files[6]]
 
@@ -137,8 +137,8 @@ def test_what_an_earlier_run_has_found_is_kept(folder, monkeypatch):
     """Features of one batch, and pairs that COLMAP's own matcher has matched."""
     pictures, work = find_pictures(folder), folder / "work"
     database, pycolmap = work / "database.db", matching.pycolmap
-    matching.find_features(pictures[:5], work, silent)
-    files = [matching.grey_file(picture) for picture in pictures]
+    image_features.find_features(pictures[:5], work, silent)
+    files = [image_features.grey_file(picture) for picture in pictures]
     (work / "pairs.txt").write_text(f"{files[0]} {files[1]}\n{files[1]} {files[2]}\n")
     options = pycolmap.FeatureMatchingOptions(use_gpu=False, guided_matching=True)
     pycolmap.match_image_pairs(database, options, pycolmap.ImportedPairingOptions(match_list_path=work / "pairs.txt"))
@@ -146,7 +146,7 @@ def test_what_an_earlier_run_has_found_is_kept(folder, monkeypatch):
     decoded = []
     grey = Picture.grey
     monkeypatch.setattr(Picture, "grey", lambda self, longest: decoded.append(self.name) or grey(self, longest))
-    matching.find_features(pictures, work, silent)
+    image_features.find_features(pictures, work, silent)
     assert sorted(decoded) == [picture.name for picture in pictures[5:]]
     matching.match_features(pictures, work, silent)
     cameras, verified = content(database)
@@ -160,9 +160,9 @@ def test_what_an_earlier_run_has_found_is_kept(folder, monkeypatch):
 def test_pairs_that_were_not_chosen_are_matched_for_a_photograph_without_a_camera(folder, monkeypatch):
     """Of one photograph alone, and then by guided matching, which finds no fewer."""
     pictures, work = find_pictures(folder), folder / "work"
-    files = [matching.grey_file(picture) for picture in pictures]
+    files = [image_features.grey_file(picture) for picture in pictures]
     monkeypatch.setattr(matching, "pairs_to_match", lambda descriptors: [(0, 1), (1, 2), (4, 5)])
-    matching.find_features(pictures, work, silent)
+    image_features.find_features(pictures, work, silent)
     matching.match_features(pictures, work, silent)
     _, before = content(work / "database.db")
     assert matching.match_again({files[7]}, work, silent)
@@ -198,7 +198,7 @@ def test_ambiguous_features_match_where_the_geometry_says(plane):
     second[wrong] = random.uniform([0, 0], [800, 600], (len(wrong), 2))
     elsewhere = random.uniform([0, 0], [800, 600], (400, 2))
     images = [
-        matching.Features(k, camera, before, points, torch.tensor(descriptors))
+        image_features.Features(k, camera, before + np.arange(len(points)), points, torch.tensor(descriptors))
         for k, before, points, descriptors in (
             (1, 7, first, own), (2, 3, np.concatenate([second, elsewhere]), np.concatenate([other, rivals])),
         )
@@ -215,25 +215,32 @@ def test_ambiguous_features_match_where_the_geometry_says(plane):
 def test_the_largest_features_are_matched(folder, monkeypatch):
     """No more than `FEATURES`; matches are numbered as in the database, so their places agree with a homography."""
     pictures, work = find_pictures(folder), folder / "work"
-    matching.find_features(pictures, work, silent)
-    monkeypatch.setattr(matching, "FEATURES", 200)
-    features = matching.read_features(work / "database.db")
-    first = features[matching.grey_file(pictures[0])]
+    image_features.find_features(pictures, work, silent)
+    monkeypatch.setattr(image_features, "FEATURES", 200)
+    features = image_features.read_features(work / "database.db")
+    first = features[image_features.grey_file(pictures[0])]
     with matching.pycolmap.Database.open(work / "database.db") as opened:
         every = opened.read_keypoints(first.image)
-    sizes = np.sqrt(np.abs(every[:, 2] * every[:, 5] - every[:, 3] * every[:, 4]))
-    assert len(every) > 300 and len(first.points) == 200 and np.array_equal(every[first.first :, :2], first.points)
-    assert np.median(sizes[first.first :]) > 1.2 * np.median(sizes[: first.first])
-    list(matching.match_pairs([tuple(map(matching.grey_file, pictures[:2]))], features, work))
+    sizes = np.abs(every[:, 2] * every[:, 5] - every[:, 3] * every[:, 4])
+    assert len(every) > 300 and len(first.points) == 200 and np.array_equal(every[first.numbers, :2], first.points)
+    assert sizes[first.numbers].min() >= np.delete(sizes, first.numbers).max()
+    list(matching.match_pairs([tuple(map(image_features.grey_file, pictures[:2]))], features, work))
     ((_, _, one, other),) = matching.read_matches(work / "database.db")
     assert len(one) > 40
     homography, agreeing = cv2.findHomography(one, other, cv2.RANSAC, 4.0)
     assert homography is not None and agreeing.mean() > 0.9
 
 
+@pytest.mark.parametrize(("matches", "share"), [(None, 0.25), (10, 1.0), (15, 1.0), (30, 0.5), (60, 0.25), (900, 0.25)])
+def test_a_search_ends_when_a_geometry_of_fifteen_matches_would_be_found(matches, share):
+    pytest.importorskip("pycolmap")
+    options = matching.verification(matches)
+    assert options.min_num_inliers == 15 and options.ransac.min_inlier_ratio == share
+
+
 def test_an_interrupted_run_loses_at_most_a_batch(folder, monkeypatch):
     pictures, work = find_pictures(folder), folder / "work"
-    matching.find_features(pictures, work, silent)
+    image_features.find_features(pictures, work, silent)
     calls, match = [], matching.match_pair
 
     def interrupted(*features):
@@ -256,6 +263,6 @@ def test_photographs_from_one_place_are_refused(folder):
     for k in range(8):
         cv2.imwrite(f"{folder}/a photograph {k}.png", np.roll(page, k, 1))
     pictures = find_pictures(folder)
-    matching.find_features(pictures, folder / "work", silent)
+    image_features.find_features(pictures, folder / "work", silent)
     with pytest.raises(InputError, match="100% of the first 28 pairs are from one place"):
         matching.match_features(pictures, folder / "work", silent)

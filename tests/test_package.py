@@ -86,6 +86,12 @@ def test_help_is_quick_for_it_imports_neither_torch_nor_scipy():
     assert all(f"mi-ring {command} " in done.stdout or f"mi-ring {command}\n" in done.stdout for command in COMMANDS)
 
 
+def test_a_fit_begins_without_what_it_needs_at_its_end():
+    code = "import sys; import mi_ring.fitting.fit; assert not {'matplotlib', 'scipy.stats'} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_program_tells_its_version():
     done = subprocess.run([sys.executable, "-m", "mi_ring", "--version"], capture_output=True, text=True)
     assert done.stdout == f"{mi_ring.__version__}\n"

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -279,6 +280,15 @@ def test_what_was_not_used_for_the_longest_time_leaves_the_cache_first():
     assert left == {0, 3, 4} and cache.size() == 3000
     cache.empty()
     assert cache.size() == 0
+
+
+def test_threads_that_prune_at_the_same_time_remove_no_more_than_one_would(tmp_path, monkeypatch):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    for k in range(400):
+        cache.store(f"{k:032x}", bytes(1000))
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(cache.prune, [300_000] * 8))
+    assert cache.size() == 240_000
 
 
 def test_the_hull_of_crops_knows_that_nothing_is_outside(tmp_path):

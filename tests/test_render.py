@@ -500,7 +500,7 @@ def test_a_film_of_photographs_shows_them_as_their_camera_records_them(tmp_path,
     film.close()
 
 
-def test_an_interrupted_film_leaves_the_old_one(tmp_path, run):
+def test_an_interrupted_film_leaves_the_old_one(tmp_path, run, capsys):
     film = tmp_path / "film.mp4"
     film.write_bytes(b"before")
 
@@ -512,6 +512,7 @@ def test_an_interrupted_film_leaves_the_old_one(tmp_path, run):
         with pytest.raises(type(error)):
             write_film(pictures(error), film, (56, 40), 24)
         assert film.read_bytes() == b"before" and {p.name for p in tmp_path.iterdir()} == {"film.mp4", "ring.pt"}
+    assert capsys.readouterr().err == f"{film}: interrupted; no film is written\n"
 
 
 @contextlib.contextmanager

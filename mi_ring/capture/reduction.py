@@ -19,7 +19,7 @@ from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.images import ROWS, box_filter
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.system import cache
-from mi_ring.system.cached_arrays import archived, key_of, remembered
+from mi_ring.system.cached_arrays import archived, key_of, read_archive, remembered
 from mi_ring.system.files import digest
 from mi_ring.system.machine import in_threads
 from mi_ring.system.progress import progress
@@ -116,20 +116,22 @@ def mask_bounds(capture: Capture, large: bool) -> list[np.ndarray | None]:
     several = {reader: k for k, reader in enumerate(capture.masks.readers) if reader}  # some may share a mask
 
     def bounds(k: int) -> np.ndarray:
-        read = capture.masks.readers[k]
+        read, shot = capture.masks.readers[k], capture.shots[k]
         assert read is not None
         file = source(read) if large else None
-        make = partial(corners, read, capture.shots[k])
-        return remembered(key_of("bounds", file), make)["corners"] if file else make()["corners"]
+        make = partial(corners, read, shot)
+        (found,) = remembered(key_of("bounds", file, shot.window), make) if file else make()
+        return found
 
     found = dict(zip(several, in_turn(bounds, capture, list(several.values()), "reading masks")))
     return [found[reader] if reader and found[reader].any() else None for reader in capture.masks.readers]
 
 
-def corners(read: Reader, shot: Shot) -> dict[str, np.ndarray]:
-    """Find the lowest and the highest corner of the object in a mask, (2, 2) int32 [px of the photograph].
+def corners(read: Reader, shot: Shot) -> tuple[np.ndarray]:
+    """Find the lowest and the highest corner of the object in a mask.
 
-    Returns {"corners": array}, which is 0 if the mask is empty.
+    Returns them in a tuple of one array, (2, 2) int32: (column, row) [px of the photograph]. If the mask is empty, they
+    are 0.
     """
     inside = read() > 127  # not kept: it may be large
     columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
@@ -138,7 +140,7 @@ def corners(read: Reader, shot: Shot) -> dict[str, np.ndarray]:
         found[:] = (columns[0], rows[0]), (columns[-1] + 1, rows[-1] + 1)
         if shot.window:  # in pixels of the photograph
             found = np.clip((found + MORE) * shot.window.scale, 0, shot.window.whole).astype(np.int32)
-    return {"corners": found}
+    return (found,)
 
 
 def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
@@ -302,16 +304,14 @@ def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | Linea
     If the entry is missing or damaged, return `make()` instead. `name`: "images", "masks" or "valid". "images" gives a
     `LinearImage`. A damaged entry is removed.
     """
-    path = cache.cached(key)
     try:
-        with np.load(path or "") as file:
+        with read_archive(key) as file:
             array = file[name]
             if name != "images":
                 return array
             clipped = np.unpackbits(file["clipped"], count=array.size).reshape(array.shape)
             return LinearImage(array, clipped.astype(bool))
-    except Exception:  # numpy and zipfile raise errors of all kinds for damaged files
-        if path:
-            with contextlib.suppress(OSError):  # the folder may be read-only
-                path.unlink()  # so that it is made anew the next time
+    except (OSError, ValueError):  # it is missing or damaged
+        with contextlib.suppress(OSError):  # there is none, or the folder may be read-only
+            (cache.cache_folder() / key).unlink()  # so that it is made anew the next time
         return make()

@@ -1,7 +1,6 @@
 """Domains. A domain is the surface from which Shape-Net's flow starts, and on which BRDF-Net is defined."""
 
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,7 +10,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mi_ring.system.cached_arrays import key_of, remembered
+from mi_ring.system import cache
+from mi_ring.system.cached_arrays import environment, key_of, remembered
 from mi_ring.system.optional import LazyPackage
 
 gpytoolbox = LazyPackage("gpytoolbox", "a start from another surface than the sphere")  # its import takes a second
@@ -105,14 +105,15 @@ class Domain:
     def triangulate(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         """Make a mesh of the surface with about 20 · 4^level triangles. Returns (vertices (V, 3), faces (F, 3)).
 
-        The cache folder keeps it.
+        The cache folder keeps the mesh.
         """
-        key = key_of("triangles", Path(__file__).read_bytes(), level, self.points, self.faces)
-        mesh = remembered(key, lambda: dict(zip(("vertices", "faces"), self.remesh(level))))
-        return mesh["vertices"], mesh["faces"]
+        key = key_of("triangles", environment(), level, self.points, self.faces)
+        vertices, faces = remembered(key, lambda: self.remesh(level))
+        cache.prune()
+        return vertices, faces
 
     def remesh(self, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the mesh of `triangulate`."""
+        """Compute the mesh of `triangulate`: vertices (V, 3) and faces (F, 3)."""
         if level > REMESHED:
             points, faces = trimesh.remesh.subdivide(*self.sample(level - 1))
             return self.project(points), faces

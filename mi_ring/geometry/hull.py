@@ -1,10 +1,8 @@
 """The visual hull of masks. It contains all points whose projections are inside the masks. A fit may start from it."""
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +15,8 @@ from torch.nn import functional as F
 
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera, distortion_factor, nearest_point
-from mi_ring.system.cached_arrays import key_of, remembered
+from mi_ring.system import cache
+from mi_ring.system.cached_arrays import environment, key_of, remembered
 
 MIN_SHARE = 0.25  #: a point is outside if a smaller share of the photographs shows it
 MAX_MASKS, MAX_WIDTH = 128, 512  #: limits of the number of silhouettes and their width [px]; more hardly help
@@ -102,7 +101,7 @@ class Hull:
 
     @functools.cached_property
     def distances(self) -> list[Tensor]:
-        """For each silhouette, the `signed_distance` (H, W) from its outline [px]."""
+        """For each silhouette, the `signed_distance` (H, W) from its outline [px]. Only a new surface needs it."""
         return [torch.from_numpy(signed_distance(s.mask)) for s in self.silhouettes]
 
     @staticmethod
@@ -205,13 +204,14 @@ class Hull:
         `resolution`: number of grid cells along the longest side. The cache folder keeps the mesh. Raises NoHull if the
         hull is empty.
         """
-        views = [(s.mask, s.valid, s.frame, *s.camera) for s in self.silhouettes]
-        key = key_of("hull", Path(__file__).read_bytes(), self.outliers, resolution, *itertools.chain(*views))
-        mesh = remembered(key, lambda: self.march(resolution))
-        return trimesh.Trimesh(mesh["vertices"], mesh["faces"], process=False)
+        parts = [part for s in self.silhouettes for part in (s.mask, s.valid, s.frame, *s.camera)]
+        key = key_of("hull", environment(), self.center, self.reach, self.outliers, resolution, *parts)
+        vertices, faces = remembered(key, lambda: self.march(resolution))
+        cache.prune()
+        return trimesh.Trimesh(vertices, faces, process=False)
 
-    def march(self, resolution: int) -> dict[str, np.ndarray]:
-        """Compute the mesh of `surface` by marching cubes: "vertices" (V, 3) and "faces" (F, 3)."""
+    def march(self, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the mesh of `surface`: vertices (V, 3) [scene units] and faces (F, 3). Raises NoHull."""
         low, high = self.center - self.reach, self.center + self.reach
         spacing = 2 * self.reach / 64
         points, shape = self.grid(low, high, spacing)
@@ -231,7 +231,7 @@ class Hull:
         vertices, faces, _, _ = skimage.measure.marching_cubes(field, 0.0, gradient_direction="ascent")
         mesh = trimesh.Trimesh((vertices - 1) * fine + low, faces)
         largest = max(mesh.split(only_watertight=False), key=lambda piece: piece.area)
-        return {"vertices": largest.vertices, "faces": largest.faces}
+        return np.asarray(largest.vertices), np.asarray(largest.faces)
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:

@@ -163,8 +163,10 @@ def half_pixel(hull: Hull) -> str | None:
 
     Returns a sentence for the user; None if they are not.
     """
-    gaps, hull, some = dict[float, float](), copy.copy(hull), evenly_spaced(len(hull.silhouettes), 32)
-    silhouettes, hull.distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
+    gaps, some = dict[float, float](), evenly_spaced(len(hull.silhouettes), 32)
+    silhouettes, distances = [hull.silhouettes[k] for k in some], [hull.distances[k] for k in some]
+    hull = copy.copy(hull)
+    hull.distances = distances
     for shift in (-0.5, 0.0, 0.5):
         hull.silhouettes = [with_camera(s, centre=s.camera.centre + shift) for s in silhouettes]
         gaps[shift] = float(np.mean(hull.shortfall(pixels=50, samples=96, outline=True).clip(max=2)))

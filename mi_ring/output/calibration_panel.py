@@ -1,6 +1,6 @@
 """The section of the report about refined calibration: a table, and charts of the values before and after the fit."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from mi_ring.output.ambiguity import ambiguity
 from mi_ring.output.svg import new_figure, svg_uri
 from mi_ring.rendering.spherical_harmonics import PER_FRAME, room_envmap
 from mi_ring.scene.assembly import lamp_lights
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
 VISIBLE = 0.01  #: the least shift of a photograph that is drawn [px]
@@ -144,11 +147,10 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
         return svg_uri(figure)
 
 
-def draw_plan(axes: Any, capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
+def draw_plan(axes: "Axes", capture: Capture, plane: np.ndarray, colour: str, label: str) -> None:
     """Draw cameras, viewing directions and lights of a capture into `axes`, projected orthogonally to a plane.
 
-    `axes`: a matplotlib.axes.Axes. `plane` (2, 3): two orthogonal unit vectors that span it. `colour`: of all marks.
-    `label`: for the legend.
+    `plane` (2, 3): two orthogonal unit vectors that span the plane. `colour`: of all marks. `label`: for the legend.
     """
     poses = np.stack([shot.camera.to_world for shot in capture.shots])
     places, ahead = poses[:, :3, 3] @ plane.T, poses[:, :3, 2] @ plane.T

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,7 +25,8 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int]
     """Write pictures (H, W, 3) of linear radiance as an MP4 file (H.264) that browsers can play.
 
     `size`: (width, height) of the pictures [px]; an odd side is extended by one pixel. `fps`: pictures per second.
-    Raises InputError if the file cannot be written. After an error, no incomplete file remains.
+    Raises InputError if the file cannot be written. After an error or an interruption, which is printed, no incomplete
+    file remains.
     """
     partial = partial_path(path)  # without .mp4, so that ffmpeg must be told the format
     odd_columns, odd_rows = size[0] % 2, size[1] % 2
@@ -52,6 +54,9 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int]
                              "another place")  # fmt: skip
         with writing(path):
             os.replace(partial, path)
+    except KeyboardInterrupt:
+        print(f"{path}: interrupted; no film is written", file=sys.stderr)
+        raise
     finally:
         ffmpeg.kill()
         ffmpeg.wait()

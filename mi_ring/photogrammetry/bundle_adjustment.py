@@ -7,8 +7,8 @@ import numpy as np
 
 from mi_ring.importers.camera_models import Lens
 from mi_ring.photogrammetry.folder import Picture
+from mi_ring.photogrammetry.image_features import grey_file
 from mi_ring.photogrammetry.marker_sheet import Detections, triangulate
-from mi_ring.photogrammetry.matching import grey_file
 from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 

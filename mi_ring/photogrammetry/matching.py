@@ -1,6 +1,6 @@
-"""Finds image features with COLMAP's library, and matches them between photographs with matrix products.
+"""Matches the features of photographs with matrix products. COLMAP's library verifies the matches.
 
-Features and matches are kept in COLMAP's database, in which an image is the reduced grey file of a photograph.
+They are kept in COLMAP's database, in which an image is the reduced grey file of a photograph.
 """
 
 import itertools
@@ -8,30 +8,25 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import numpy as np
 import torch
-from PIL import Image
 
 from mi_ring.errors import InputError
-from mi_ring.images import encoded_picture
 from mi_ring.nets.chunks import in_parallel
-from mi_ring.photogrammetry.folder import DECODED, Picture, focal_35mm
+from mi_ring.photogrammetry.folder import Picture
+from mi_ring.photogrammetry.image_features import Features, batches, grey_file, read_features
 from mi_ring.system.files import write_file
-from mi_ring.system.machine import cores, in_threads, interruptible
+from mi_ring.system.machine import interruptible
 from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress
 
 pycolmap = LazyPackage("pycolmap", "structure from motion")
-#: Longer side of the images in which features are searched [px], maximum number of features, and their least contrast.
-#: A smooth object has few strong features: weak ones are kept, and geometric verification removes the wrong ones.
-LONGEST, FEATURES, PEAK = 1600, 4096, 0.003
 LENGTH = 512.0  #: of a descriptor
 #: Largest angle between the descriptors of a match [radians], also as a share of the angle to the second nearest one:
 #: RATIO to find the geometry of two photographs, LOOSE for matches that agree with it.
 ANGLE, RATIO, LOOSE = 0.7, 0.8, 0.95
-TRIALS = 1.5  #: of geometries of a pair, relative to those that suffice for its inliers with a probability of 99.9 %
+TRIALS = 1.5  #: of RANSAC, as a multiple of the number that finds the geometry with a probability of 99.9 %
 FAR = 4.0  #: the largest distance of a match that agrees [px]
 LINE = 16  #: floats in a line of the processor's cache
 BLOCK = 512  #: rows of a matrix of products that is computed at a time, so that it stays in the processor's cache
@@ -42,95 +37,6 @@ BATCH = 60  #: pairs that are matched at a time
 MIN_MATCHES = 50  #: of a pair of photographs that overlap
 #: A pair is static if the features' motion varies by less than STATIC [widths]. MAX_STATIC: largest share of them.
 STATIC, MAX_STATIC = 0.01, 0.9
-
-
-def find_features(pictures: Sequence[Picture], folder: Path, progress: Progress) -> None:
-    """Find the image features of photographs. Shows a progress bar.
-
-    Writes reduced grey images to `folder`/grey, and features to the COLMAP database `folder`/database.db. Images that
-    have features there already are skipped.
-    """
-    list(progress(extract_features(pictures, folder), "features", len(pictures)))
-
-
-def extract_features(pictures: Sequence[Picture], folder: Path) -> Iterator[Picture]:
-    """Find the image features of photographs. Yields each photograph when its features are in the database.
-
-    Writes reduced grey images to `folder`/grey, and features to the COLMAP database `folder`/database.db. Images that
-    have features there already are yielded, too, without work.
-    """
-    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=cores())
-    options.sift.max_num_features, options.sift.peak_threshold = FEATURES, PEAK
-    database, grey = folder / "database.db", folder / "grey"
-
-    def write_grey(picture: Picture) -> tuple[int, int]:
-        reduced = Image.fromarray(picture.grey(LONGEST))
-        picture.close()
-        write_file(grey / grey_file(picture), encoded_picture(reduced))
-        return reduced.size
-
-    for size in dict.fromkeys(picture.size for picture in pictures):  # one camera each
-        own = [picture for picture in pictures if picture.size == size]
-        cameras = camera_ids(database)
-        yield from (picture for picture in own if grey_file(picture) in cameras)
-        missing = [picture for picture in own if grey_file(picture) not in cameras]
-        for batch in batches(missing, 4 * cores()):
-            sizes = list(in_threads(write_grey, batch, most=DECODED))
-            reader, cameras = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL"), camera_ids(database)
-            if known := [cameras[file] for file in map(grey_file, own) if file in cameras]:
-                reader.existing_camera_id = known[0]
-            elif equivalent := focal_35mm(own):
-                width, height = sizes[0]
-                reader.camera_params = f"{equivalent / 36 * max(width, height)},{width / 2},{height / 2},0"
-            files, mode = [grey_file(picture) for picture in batch], pycolmap.CameraMode.SINGLE
-            interruptible(pycolmap.extract_features, database, grey, files, mode, reader, options)
-            yield from batch
-
-
-def batches(things: Sequence[Any], count: int) -> Iterator[Sequence[Any]]:
-    """Split a sequence into parts of `count` items each. The last part may be shorter."""
-    return (things[k : k + count] for k in range(0, len(things), count))
-
-
-def grey_file(picture: Picture) -> str:
-    """Return the file name of a photograph's reduced grey image. It has no spaces, which COLMAP does not allow."""
-    return f"{quote(picture.name, safe='')}.png"
-
-
-def camera_ids(database: Path) -> dict[str, int]:
-    """Return the camera ids of the images in a COLMAP database, by file name; empty if there is no such file."""
-    if not database.is_file():
-        return {}
-    with pycolmap.Database.open(database) as opened:
-        return {image.name: image.camera_id for image in opened.read_all_images()}
-
-
-class Features(NamedTuple):
-    """The features of an image in COLMAP's database, the `FEATURES` largest of them."""
-
-    image: int  #: its number there
-    camera: Any  #: pycolmap's camera
-    first: int  #: index there of the first of these features; smaller ones are before it
-    points: np.ndarray  #: (n, 2) where they are [px]
-    descriptors: torch.Tensor  #: (n, 128) uint8
-
-
-def read_features(database: Path) -> dict[str, Features]:
-    """Read the features of all images in a COLMAP database. Returns them by file name.
-
-    COLMAP limits the number of places; a place may have features of several orientations. It sorts them by size.
-    """
-    found = {}
-    with pycolmap.Database.open(database) as opened:
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        for image in opened.read_all_images():
-            points = opened.read_keypoints(image.image_id)[:, :2].astype(float)
-            descriptors = torch.tensor(opened.read_descriptors(image.image_id).data).reshape(-1, 128)
-            first = max(0, len(points) - FEATURES)
-            found[image.name] = Features(
-                image.image_id, cameras[image.camera_id], first, points[first:], descriptors[first:]
-            )
-    return found
 
 
 class Nearest(NamedTuple):
@@ -205,23 +111,23 @@ def match_pair(first: Features, second: Features) -> Any:
     )
     if len(geometry.inlier_matches):
         a, b = (own.points[column] for own, column in zip((first, second), matches.T))
-        agreeing = matches[distances(geometry, a, b) <= FAR]
-        geometry.inlier_matches = agreeing + np.array([first.first, second.first], np.uint32)
+        one, other = matches[distances(geometry, a, b) <= FAR].T
+        geometry.inlier_matches = np.column_stack([first.numbers[one], second.numbers[other]]).astype(np.uint32)
     return geometry
 
 
-def verification(matches: int = 0) -> Any:
+def verification(matches: int | None = None) -> Any:
     """Return options for COLMAP's geometric verification, with a fixed random seed, so that results can be repeated.
 
-    `matches`: of the pair, if it is known. It has no more trials than are needed to find a geometry with the least
-    number of inliers among them. Pairs that do not overlap, with their few matches, would take the longest otherwise.
+    `matches`: number of matches of the pair; None: unknown. The search ends after as many trials as find a geometry of
+    which the least number of matches are inliers. Otherwise pairs that do not overlap would take the longest.
     """
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
+    options.ransac.dyn_num_trials_multiplier = TRIALS
     if matches:
-        least = options.min_num_inliers / matches
-        options.ransac.min_inlier_ratio = min(1.0, max(options.ransac.min_inlier_ratio, least))
-        options.ransac.dyn_num_trials_multiplier = TRIALS
+        least = min(1.0, options.min_num_inliers / matches)
+        options.ransac.min_inlier_ratio = max(options.ransac.min_inlier_ratio, least)
     return options
 
 

@@ -17,15 +17,9 @@ from mi_ring.images import read_image
 from mi_ring.importers.camera_models import Lens
 from mi_ring.photogrammetry.bundle_adjustment import adjust, model_cameras, registered
 from mi_ring.photogrammetry.folder import Picture
+from mi_ring.photogrammetry.image_features import find_features, grey_file
 from mi_ring.photogrammetry.marker_sheet import Detections
-from mi_ring.photogrammetry.matching import (
-    MIN_MATCHES,
-    find_features,
-    grey_file,
-    match_again,
-    match_features,
-    read_matches,
-)  # fmt: skip
+from mi_ring.photogrammetry.matching import MIN_MATCHES, match_again, match_features, read_matches
 from mi_ring.system.machine import interruptible
 from mi_ring.system.optional import LazyPackage
 from mi_ring.system.progress import Progress

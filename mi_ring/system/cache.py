@@ -10,7 +10,7 @@ import platformdirs
 from mi_ring.errors import InputError
 
 VARIABLE = "MI_RING_CACHE"  #: environment variable with another folder
-OWN = "photographs"  #: the folder in it for our files
+OWN = "photographs"  #: the folder in it for our files: reduced photographs, and surfaces of their masks
 NAME = re.compile(r"[0-9a-f]{32}|\.[0-9a-f]{32}\..*\.partial")  #: of our files, finished or not
 LIMIT = 8 * 2**30  #: largest size of all files [bytes]
 PRUNED = 0.8  #: share of the limit that is left after files were removed
@@ -79,7 +79,7 @@ def prune(limit: int = LIMIT) -> None:
         if total <= least:
             break
         with contextlib.suppress(OSError):
-            path.unlink()
+            path.unlink(missing_ok=True)  # another process or thread may remove files at the same time
             total -= own
 
 
