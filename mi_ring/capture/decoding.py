@@ -18,11 +18,21 @@ class LinearImage(NamedTuple):
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance, float16 or float32
     clipped: np.ndarray  #: (H, W, 3) bool
+    gamma: float = 1.0  #: exponent of the camera's tone curve that was removed
+    contrast: float = 1.0  #: S-curve of it
 
     @property
     def nbytes(self) -> int:
         """Number of bytes that `rgb` and `clipped` need together."""
         return self.rgb.nbytes + self.clipped.nbytes
+
+    def radiance(self, gamma: float, contrast: float) -> np.ndarray:
+        """Return the radiance (H, W, 3) float32 as if this tone curve had been removed instead."""
+        linear = self.rgb.astype(np.float32)
+        if (gamma, contrast) == (self.gamma, self.contrast):
+            return linear
+        recorded = contrasted(np.maximum(linear, 0) ** np.float32(self.gamma), self.contrast / contrast)
+        return recorded.astype(np.float32) ** np.float32(1 / gamma)
 
 
 def decode(
@@ -32,10 +42,10 @@ def decode(
 
     `linear`: True if the encoded pixels are linear, False if they are sRGB. `saturation`: encoded value (1 = full
     scale) from which a pixel is clipped. `gamma`, `contrast`: exponent and S-curve of the camera's tone curve, which is
-    removed; 1: none. A `LinearImage` is already decoded, and is returned unchanged.
+    removed; 1: none. A `LinearImage` is decoded already, but maybe by another curve.
     """
     if isinstance(image, LinearImage):
-        return image.rgb.astype(np.float32), image.clipped
+        return image.radiance(gamma, contrast), image.clipped
     if image.dtype == np.float32:
         value = image
     else:

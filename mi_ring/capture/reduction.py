@@ -225,7 +225,7 @@ def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
             clipped[first : first + rows] = averaged(over, blocks) > 0
     image = part = linear = np.empty(0)  # views keep the photograph in memory; it is larger than what was made of it
     over = resized(clipped.astype(np.float32), window) > 0
-    return LinearImage(resized(radiance, window).astype(kept), over)
+    return LinearImage(resized(radiance, window).astype(kept), over, shot.response.gamma, shot.response.contrast)
 
 
 def reduced_mask(read: Reader, window: Window) -> np.ndarray:
@@ -295,7 +295,8 @@ def packed(arrays: dict[str, Any]) -> memoryview:
     `arrays`: a dict with "images" (a `LinearImage`), and "masks" and "valid" if the photograph has them.
     """
     image = arrays["images"]
-    return archived(arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped)})
+    curve = np.array([image.gamma, image.contrast])
+    return archived(arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped), "curve": curve})
 
 
 def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | LinearImage:
@@ -310,7 +311,7 @@ def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | Linea
             if name != "images":
                 return array
             clipped = np.unpackbits(file["clipped"], count=array.size).reshape(array.shape)
-            return LinearImage(array, clipped.astype(bool))
+            return LinearImage(array, clipped.astype(bool), *file["curve"].tolist())
     except (OSError, ValueError):  # it is missing or damaged
         with contextlib.suppress(OSError):  # there is none, or the folder may be read-only
             (cache.cache_folder() / key).unlink()  # so that it is made anew the next time
