@@ -114,7 +114,8 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
             if not hasattr(network, needed):
                 raise InputError(f"networks: {type(network).__name__}: has no {needed}; give (Shape-Net, BRDF-Net)")
         if isinstance(networks[0], DetailedFlow) or isinstance(networks[1], DetailedMaterial | SharpenedMaterial):
-            raise InputError("networks: have details, which a fit adds itself; give their base.network instead")
+            raise InputError("networks: have details or a texture, which a fit adds itself; give the networks in them: "
+                             "`base.network` of details, `base` of a texture")  # fmt: skip
         networks[1].set_parameters(parameters, scale)
     else:
         networks = (shape_net_of(config.shape_net, config.steps, config.encoding, config.frequencies),
