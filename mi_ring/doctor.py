@@ -89,7 +89,9 @@ def main(arguments: Sequence[str]) -> int:
     Returns its exit status: 1 if a fit cannot run, otherwise 0.
     """
     if command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False).empty_cache:
+        before = cache.size()
         cache.empty()
+        print(f"The cache folder is empty: {before / 2**20:.0f} MiB removed")
     found = list(findings())
     for mark, what, text in found:
         print(f"{mark:8} {what:11} {text}")
