@@ -91,7 +91,9 @@ def main(arguments: Sequence[str]) -> int:
     if command.parse(DoctorConfig, arguments, "mi_ring.doctor", needs_llvm=False).empty_cache:
         before = cache.size()
         cache.empty()
-        print(f"The cache folder is empty: {before / 2**20:.0f} MiB removed")
+        left = cache.size()
+        rest = f", {left / 2**20:.0f} MiB cannot be removed: {cache.cache_folder()} is read-only" * bool(left)
+        print(f"Removed {(before - left) / 2**20:.0f} MiB from the cache folder{rest}")
     found = list(findings())
     for mark, what, text in found:
         print(f"{mark:8} {what:11} {text}")

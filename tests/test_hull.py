@@ -64,7 +64,9 @@ def test_the_surface_is_kept_for_the_next_fit(tmp_path, monkeypatch):
     (file,) = cache.cache_folder().iterdir()
     content = file.read_bytes()
     shape = f"({len(first.faces)}, 3)".encode()
-    for damaged in (content[:-100], b"", content.replace(shape, shape.replace(b"3)", b"2)"))):
+    Hull(list(silhouettes(ball(3.0))), "scene.xml").surface(32)
+    (other,) = (own.read_bytes() for own in cache.cache_folder().iterdir() if own != file)
+    for damaged in (content[:-100], b"", content.replace(shape, shape.replace(b"3)", b"2)")), other):
         assert damaged != content
         file.write_bytes(damaged)
         made = Hull(list(silhouettes(ball(4.0))), "scene.xml").surface(32)

@@ -548,3 +548,38 @@ def test_a_blurred_photograph_has_less_detail_though_it_has_the_same_noise(tmp_p
         cv2.imwrite(str(tmp_path / f"{name}.png"), noisy.clip(0, 255).astype(np.uint8))
     sharp, blurred = (structure_from_motion.sharpness(tmp_path / f"{name}.png") for name in ("sharp", "blurred"))
     assert blurred < structure_from_motion.BLURRED * sharp
+
+
+@pytest.mark.parametrize("content", [b"SQLite format 3\0" + bytes(range(256)) * 40, b"none of COLMAP's", None])
+def test_a_damaged_database_is_an_error_that_says_what_to_do(tmp_path, content):
+    database = tmp_path / "work" / "database.db"
+    database.parent.mkdir()
+    structure_from_motion.require_sound(database)  # there is none yet
+    if content is None:
+        database.mkdir()
+    else:
+        database.write_bytes(b"")
+        structure_from_motion.require_sound(database)
+        database.write_bytes(content)
+    with pytest.raises(InputError, match=r"work/database.db: is damaged; remove .*/work and give the same command"):
+        structure_from_motion.require_sound(database)
+
+
+def test_a_database_of_colmap_is_sound_unless_a_part_is_lost(tmp_path):
+    pycolmap, database = pytest.importorskip("pycolmap"), tmp_path / "database.db"
+    with pycolmap.Database.open(database) as opened:
+        for k in range(2000):
+            opened.write_camera(pycolmap.Camera.create_from_model_name(k + 1, "SIMPLE_RADIAL", 900, 800, 600), True)
+    structure_from_motion.require_sound(database)
+    content = database.read_bytes()
+    database.write_bytes(content[: len(content) // 8192 * 4096])
+    with pytest.raises(InputError, match="database.db: is damaged"):
+        structure_from_motion.require_sound(database)
+
+
+def test_a_damaged_model_is_an_error_that_says_what_to_do(tmp_path):
+    pytest.importorskip("pycolmap")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match="is damaged; remove it and give the same command again"):
+        structure_from_motion.read_model(tmp_path)

@@ -170,7 +170,7 @@ def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
         if cache.cached(key):
             return stored
         arrays = {name: made() for name, made in make.items()}
-        if cache.store(key, packed(arrays)):
+        if cache.store(key, packed(key, arrays)):
             return stored
         return {name: partial(arrays.get, name) for name in arrays}
 
@@ -289,14 +289,14 @@ def source(read: Reader | None) -> tuple | None:
     return read.func.__name__, *(file and digest(file) for file in files), files[0] == shot.files.filename
 
 
-def packed(arrays: dict[str, Any]) -> memoryview:
-    """Convert a reduced photograph and its masks to bytes for the cache folder.
+def packed(key: str, arrays: dict[str, Any]) -> memoryview:
+    """Convert a reduced photograph and its masks to bytes for the entry `key` of the cache folder.
 
     `arrays`: a dict with "images" (a `LinearImage`), and "masks" and "valid" if the photograph has them.
     """
     image = arrays["images"]
     curve = np.array([image.gamma, image.contrast])
-    return archived(arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped), "curve": curve})
+    return archived(key, arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped), "curve": curve})
 
 
 def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | LinearImage:

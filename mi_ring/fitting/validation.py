@@ -57,9 +57,9 @@ def texture_helps(
     """
     if not len(problem.held_out):
         return True
+    width = max(COMPARED_WIDTH, *problem.config.widths)
     without, with_texture = (
-        unexplained(problem, refined, shown(surface, one), ring.indirect, max(problem.config.widths))
-        for one in (ring, sharp)
+        unexplained(problem, refined, shown(surface, one), ring.indirect, width) for one in (ring, sharp)
     )
     return not with_texture >= without
 

@@ -1,6 +1,8 @@
 """Structure from motion by COLMAP: cameras and points. A `model` is a `pycolmap.Reconstruction`."""
 
+import contextlib
 import hashlib
+import sqlite3
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -75,8 +77,9 @@ def structure_from_motion(
     """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     sparse = folder / "sparse"
+    require_sound(folder / "database.db")
     if sparse.is_dir():
-        return to_sparse_model(pycolmap.Reconstruction(sparse), pictures, folder)
+        return to_sparse_model(read_model(sparse), pictures, folder)
     (folder / "grey").mkdir(parents=True, exist_ok=True)
     find_features(pictures, folder, progress)
     match_features(pictures, folder, progress)
@@ -98,6 +101,28 @@ def structure_from_motion(
     model.write(partial)
     partial.rename(sparse)
     return to_sparse_model(model, pictures, folder)
+
+
+def require_sound(database: Path) -> None:
+    """Raise InputError if the file of COLMAP's database is damaged. A missing or empty one is none yet."""
+    if not database.exists():
+        return
+    try:
+        with contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as opened:
+            sound = opened.execute("PRAGMA quick_check").fetchone() == ("ok",)
+    except sqlite3.DatabaseError:
+        sound = False
+    if not sound:
+        raise InputError(f"{database}: is damaged; remove {database.parent} and give the same command again")
+
+
+def read_model(folder: Path) -> Any:
+    """Read a COLMAP model from a folder. Raises InputError if it is damaged."""
+    with contextlib.suppress(IndexError, RuntimeError, ValueError):
+        model = pycolmap.Reconstruction(folder)
+        if model.num_reg_images():
+            return model
+    raise InputError(f"{folder}: is damaged; remove it and give the same command again")
 
 
 def placed_files(model: Any) -> set[str]:
@@ -243,7 +268,8 @@ def failure_reasons(pictures: Sequence[Picture], placed: Iterable[str], folder: 
     detail = {p.name: sharpness(folder / "grey" / grey_file(p)) for p in pictures} if failed else {}
     for name, file in ((picture.name, grey_file(picture)) for picture in failed):
         with pycolmap.Database.open(folder / "database.db") as opened:
-            features = opened.num_keypoints_for_image(opened.read_image_with_name(file).image_id)
+            image = opened.read_image_with_name(file)  # None if the user has removed the database
+            features = opened.num_keypoints_for_image(image.image_id) if image else TEXTURED
         reasons[name] = ("nothing in it matches the others: it shows something else, or photographs in between are "
                          "missing")  # fmt: skip
         if features < TEXTURED:

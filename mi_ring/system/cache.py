@@ -33,7 +33,7 @@ def cached(key: str) -> Path | None:
     path = cache_folder() / key
     with contextlib.suppress(OSError):  # in a folder that is only read
         os.utime(path)
-    return path if path.is_file() else None
+    return path if os.path.isfile(path) else None  # False, too, in a folder that must not be read
 
 
 def store(key: str, content: bytes | memoryview) -> bool:

@@ -43,10 +43,10 @@ def environment() -> tuple[str, ...]:
     return *versions, torch.backends.cpu.get_cpu_capability()
 
 
-def archived(arrays: Mapping[str, np.ndarray]) -> memoryview:
-    """Return the bytes of a .npz file of arrays by name, with a checksum at its end."""
+def archived(key: str, arrays: Mapping[str, np.ndarray]) -> memoryview:
+    """Return the bytes of a .npz file of arrays by name, and of its key, with a checksum at its end."""
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # mypy takes the arrays for options
+    np.savez(buffer, key=np.array(key), **arrays)  # type: ignore[arg-type]  # mypy takes the arrays for options
     files.seal(buffer)
     return buffer.getbuffer()
 
@@ -54,13 +54,16 @@ def archived(arrays: Mapping[str, np.ndarray]) -> memoryview:
 def read_archive(key: str) -> Any:
     """Open the cached file with this key, made by `archived`: numpy's NpzFile.
 
-    Raises ValueError if there is none or if it is damaged, OSError if it cannot be read.
+    Raises ValueError if there is none, if it is damaged or of another key, OSError if it cannot be read.
     """
     path = cache.cached(key)
     content = path.read_bytes() if path else b""
     if not files.is_sealed(content):
         raise ValueError(f"{key}: is missing or damaged")
-    return np.load(io.BytesIO(content))
+    stored = np.load(io.BytesIO(content))
+    if stored.get("key") != key:
+        raise ValueError(f"{key}: is of another key")
+    return stored
 
 
 def remembered(key: str, make: Callable[[], tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
@@ -69,7 +72,7 @@ def remembered(key: str, make: Callable[[], tuple[np.ndarray, ...]]) -> tuple[np
     `key`: from `key_of`. `make`: function that computes the arrays. Call `cache.prune` afterwards.
     """
     with contextlib.suppress(OSError, ValueError), read_archive(key) as stored:
-        return tuple(stored.values())
+        return tuple(array for name, array in stored.items() if name != "key")
     arrays = make()
-    cache.store(key, archived({f"{number:03}": array for number, array in enumerate(arrays)}))
+    cache.store(key, archived(key, {f"{number:03}": array for number, array in enumerate(arrays)}))
     return arrays
