@@ -92,8 +92,9 @@ def main(arguments: Sequence[str]) -> int:
         before = cache.size()
         cache.empty()
         left = cache.size()
-        rest = f", {left / 2**20:.0f} MiB cannot be removed: {cache.cache_folder()} is read-only" * bool(left)
-        print(f"Removed {(before - left) / 2**20:.0f} MiB from the cache folder{rest}")
+        print(f"Removed {(before - left) / 2**20:.0f} MiB from the cache folder")
+        if left:
+            print(f"{left / 2**20:.1f} MiB could not be removed: {cache.cache_folder()}")
     found = list(findings())
     for mark, what, text in found:
         print(f"{mark:8} {what:11} {text}")

@@ -162,7 +162,7 @@ def test_pictures_and_maps_show_it(sharp, print_scene):
 
 
 def test_held_out_photographs_decide(sharp, print_scene):
-    """The texture stays; the opposite of it, as of photographs in wrong places, does not. Nothing is said by none."""
+    """The texture stays; the opposite of it, as of photographs in wrong places, does not. Without any, it stays."""
     capture, ring = load_capture(print_scene, width=160), pale_ball()
     wrong = copy.deepcopy(sharp)
     wrong.brdf_net.grid.values[0].data.neg_()

@@ -27,7 +27,10 @@ class LinearImage(NamedTuple):
         return self.rgb.nbytes + self.clipped.nbytes
 
     def radiance(self, gamma: float, contrast: float) -> np.ndarray:
-        """Return the radiance (H, W, 3) float32 as if this tone curve had been removed instead."""
+        """Return the radiance (H, W, 3) float32 as if this tone curve had been removed instead.
+
+        This is approximate at edges, because pixels were averaged under the other curve.
+        """
         linear = self.rgb.astype(np.float32)
         if (gamma, contrast) == (self.gamma, self.contrast):
             return linear
@@ -42,7 +45,8 @@ def decode(
 
     `linear`: True if the encoded pixels are linear, False if they are sRGB. `saturation`: encoded value (1 = full
     scale) from which a pixel is clipped. `gamma`, `contrast`: exponent and S-curve of the camera's tone curve, which is
-    removed; 1: none. A `LinearImage` is decoded already, but maybe by another curve.
+    removed; 1: none. A `LinearImage` is decoded already; if another curve was
+    removed, it is converted.
     """
     if isinstance(image, LinearImage):
         return image.radiance(gamma, contrast), image.clipped

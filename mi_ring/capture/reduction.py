@@ -312,7 +312,9 @@ def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | Linea
                 return array
             clipped = np.unpackbits(file["clipped"], count=array.size).reshape(array.shape)
             return LinearImage(array, clipped.astype(bool), *file["curve"].tolist())
-    except (OSError, ValueError):  # it is missing or damaged
+    except OSError:  # it cannot be read now
+        return make()
+    except ValueError:  # it is missing or damaged
         with contextlib.suppress(OSError):  # there is none, or the folder may be read-only
             (cache.cache_folder() / key).unlink()  # so that it is made anew the next time
         return make()

@@ -1,6 +1,6 @@
 """Validation on held-out photographs: do details, a texture and the refined calibration predict them better?
 
-Surface and material are not fitted again with the given calibration. So the comparison favours the refined one.
+Surface and material are not fitted again with the given calibration. So the comparison favours the refined calibration.
 """
 
 import copy
@@ -20,7 +20,11 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 
-COMPARED_WIDTH, SPP, MOST = 256, 4, 16  #: largest width [px], samples per pixel, and number of the pictures compared
+COMPARED_WIDTH, SPP, MOST = (
+    256,
+    4,
+    16,
+)  #: width, for textures the least one [px], samples per pixel, and number of the pictures compared
 #: Options that are refined for single photographs, and so are unknown of those that are held out.
 PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per == "photograph"}
 
@@ -61,7 +65,7 @@ def texture_helps(
     without, with_texture = (
         unexplained(problem, refined, shown(surface, one), ring.indirect, width) for one in (ring, sharp)
     )
-    return not with_texture >= without
+    return not with_texture >= without  # NaN: none shows the object
 
 
 def shown(surface: Surface, ring: FittedObject) -> Surface:

@@ -113,7 +113,10 @@ class Domain:
         return vertices, faces
 
     def remesh(self, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the mesh of `triangulate`: vertices (V, 3) and faces (F, 3)."""
+        """Compute the mesh of `triangulate`: vertices (V, 3) and faces (F, 3).
+
+        If it changes, change `cached_arrays.FORMAT`.
+        """
         if level > REMESHED:
             points, faces = trimesh.remesh.subdivide(*self.sample(level - 1))
             return self.project(points), faces

@@ -211,7 +211,10 @@ class Hull:
         return trimesh.Trimesh(vertices, faces, process=False)
 
     def march(self, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the mesh of `surface`: vertices (V, 3) [scene units] and faces (F, 3). Raises NoHull."""
+        """Compute the mesh of `surface`: vertices (V, 3) [scene units] and faces (F, 3). Raises NoHull.
+
+        If it changes, change `cached_arrays.FORMAT`.
+        """
         low, high = self.center - self.reach, self.center + self.reach
         spacing = 2 * self.reach / 64
         points, shape = self.grid(low, high, spacing)

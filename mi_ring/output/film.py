@@ -25,8 +25,8 @@ def write_film(pictures: Iterator[np.ndarray], path: Path, size: tuple[int, int]
     """Write pictures (H, W, 3) of linear radiance as an MP4 file (H.264) that browsers can play.
 
     `size`: (width, height) of the pictures [px]; an odd side is extended by one pixel. `fps`: pictures per second.
-    Raises InputError if the file cannot be written. After an error or an interruption, which is printed, no incomplete
-    file remains.
+    Raises InputError if the file cannot be written. An interruption is printed. After an error or an
+    interruption, no incomplete file remains.
     """
     partial = partial_path(path)  # without .mp4, so that ffmpeg must be told the format
     odd_columns, odd_rows = size[0] % 2, size[1] % 2

@@ -107,8 +107,8 @@ def read_features(database: Path) -> dict[str, Features]:
         cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
         for image in opened.read_all_images():
             places = opened.read_keypoints(image.image_id).reshape(-1, 6).astype(float)  # x, y, and a matrix (2, 2)
-            sizes = np.abs(places[:, 2] * places[:, 5] - places[:, 3] * places[:, 4])
-            numbers = np.sort(np.argsort(sizes, kind="stable")[-FEATURES:])
+            areas = np.abs(places[:, 2] * places[:, 5] - places[:, 3] * places[:, 4])
+            numbers = np.sort(np.argsort(areas, kind="stable")[-FEATURES:])
             descriptors = torch.tensor(opened.read_descriptors(image.image_id).data).reshape(-1, 128)
             camera = cameras[image.camera_id]
             found[image.name] = Features(image.image_id, camera, numbers, places[numbers, :2], descriptors[numbers])

@@ -119,13 +119,13 @@ def match_pair(first: Features, second: Features) -> Any:
 def verification(matches: int | None = None) -> Any:
     """Return options for COLMAP's geometric verification, with a fixed random seed, so that results can be repeated.
 
-    `matches`: number of matches of the pair; None: unknown. The search ends after as many trials as find a geometry of
-    which the least number of matches are inliers. Otherwise pairs that do not overlap would take the longest.
+    `matches`: number of matches of the pair; None: unknown. If it is known, the search assumes that COLMAP's least
+    number of inliers are among them. Otherwise pairs that do not overlap would take the longest.
     """
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
-    options.ransac.dyn_num_trials_multiplier = TRIALS
     if matches:
+        options.ransac.dyn_num_trials_multiplier = TRIALS
         least = min(1.0, options.min_num_inliers / matches)
         options.ransac.min_inlier_ratio = max(options.ransac.min_inlier_ratio, least)
     return options

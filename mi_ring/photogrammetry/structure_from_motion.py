@@ -77,7 +77,7 @@ def structure_from_motion(
     """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     sparse = folder / "sparse"
-    require_sound(folder / "database.db")
+    require_sound(folder / "database.db")  # also for the reasons of failures
     if sparse.is_dir():
         return to_sparse_model(read_model(sparse), pictures, folder)
     (folder / "grey").mkdir(parents=True, exist_ok=True)
@@ -104,21 +104,26 @@ def structure_from_motion(
 
 
 def require_sound(database: Path) -> None:
-    """Raise InputError if the file of COLMAP's database is damaged. A missing or empty one is none yet."""
+    """Raise InputError if the file of COLMAP's database is damaged or cannot be read. It may be missing or empty."""
     if not database.exists():
         return
+    complaint = "is damaged"
     try:
         with contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as opened:
-            sound = opened.execute("PRAGMA quick_check").fetchone() == ("ok",)
+            if opened.execute("PRAGMA quick_check").fetchone() == ("ok",):
+                return
+    except sqlite3.OperationalError as error:  # locked, or no permission
+        complaint = f"cannot be read ({error})"
     except sqlite3.DatabaseError:
-        sound = False
-    if not sound:
-        raise InputError(f"{database}: is damaged; remove {database.parent} and give the same command again")
+        pass
+    raise InputError(
+        f"{database}: {complaint}; remove it, or all of {database.parent}, and give the same command again"
+    )
 
 
 def read_model(folder: Path) -> Any:
     """Read a COLMAP model from a folder. Raises InputError if it is damaged."""
-    with contextlib.suppress(IndexError, RuntimeError, ValueError):
+    with contextlib.suppress(Exception):  # of any kind for a damaged file
         model = pycolmap.Reconstruction(folder)
         if model.num_reg_images():
             return model
