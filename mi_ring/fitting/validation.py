@@ -20,11 +20,8 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 
-COMPARED_WIDTH, SPP, MOST = (
-    256,
-    4,
-    16,
-)  #: width, for textures the least one [px], samples per pixel, and number of the pictures compared
+#: Of the pictures compared: width, for textures the least one [px]; samples per pixel; number.
+COMPARED_WIDTH, SPP, MOST = 256, 4, 16
 #: Options that are refined for single photographs, and so are unknown of those that are held out.
 PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per == "photograph"}
 

@@ -116,9 +116,7 @@ def require_sound(database: Path) -> None:
         complaint = f"cannot be read ({error})"
     except sqlite3.DatabaseError:
         pass
-    raise InputError(
-        f"{database}: {complaint}; remove it, or all of {database.parent}, and give the same command again"
-    )
+    raise InputError(f"{database}: {complaint}; remove it or all of {database.parent}, and repeat the command")
 
 
 def read_model(folder: Path) -> Any:
