@@ -550,19 +550,21 @@ def test_a_blurred_photograph_has_less_detail_though_it_has_the_same_noise(tmp_p
     assert blurred < structure_from_motion.BLURRED * sharp
 
 
-@pytest.mark.parametrize("content", [b"SQLite format 3\0" + bytes(range(256)) * 40, b"none of COLMAP's", None])
-def test_a_damaged_database_is_an_error_that_says_what_to_do(tmp_path, content):
+@pytest.mark.parametrize("damage", ["header alone", "not a database", "folder"])
+def test_a_damaged_database_is_an_error_that_says_what_to_do(tmp_path, damage):
     database = tmp_path / "work" / "database.db"
     database.parent.mkdir()
     structure_from_motion.require_sound(database)  # there is none yet
-    if content is None:
+    database.write_bytes(b"")
+    structure_from_motion.require_sound(database)
+    if damage == "folder":
+        database.unlink()
         database.mkdir()
     else:
-        database.write_bytes(b"")
-        structure_from_motion.require_sound(database)
-        database.write_bytes(content)
+        head = b"SQLite format 3\0" if damage == "header alone" else b"none of COLMAP's"
+        database.write_bytes(head + bytes(range(256)) * 40)
     with pytest.raises(
-        InputError, match=r"work/database.db: (is damaged|cannot be read .*); remove this file, or all of .*"
+        InputError, match=r"work/database.db: (is damaged|cannot be read .*); remove it or all of .*work"
     ):
         structure_from_motion.require_sound(database)
 
