@@ -45,8 +45,7 @@ def decode(
 
     `linear`: True if the encoded pixels are linear, False if they are sRGB. `saturation`: encoded value (1 = full
     scale) from which a pixel is clipped. `gamma`, `contrast`: exponent and S-curve of the camera's tone curve, which is
-    removed; 1: none. A `LinearImage` is decoded already; if another curve was
-    removed, it is converted.
+    removed; 1: none. A `LinearImage` is decoded already; it is converted if another curve was removed.
     """
     if isinstance(image, LinearImage):
         return image.radiance(gamma, contrast), image.clipped

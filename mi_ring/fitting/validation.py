@@ -58,17 +58,13 @@ def texture_helps(
     """
     if not len(problem.held_out):
         return True
-    width = max(COMPARED_WIDTH, *problem.config.widths)
-    without, with_texture = (
-        unexplained(problem, refined, shown(surface, one), ring.indirect, width) for one in (ring, sharp)
-    )
+
+    def error(shown: FittedObject) -> float:
+        surface.show(shown, *shown.domain.sample(shown.subdivisions))
+        return unexplained(problem, refined, surface, ring.indirect, max(COMPARED_WIDTH, *problem.config.widths))
+
+    without, with_texture = error(ring), error(sharp)
     return not with_texture >= without  # NaN: none shows the object
-
-
-def shown(surface: Surface, ring: FittedObject) -> Surface:
-    """Let a surface show an object at its finest level. Returns the surface."""
-    surface.show(ring, *ring.domain.sample(ring.subdivisions))
-    return surface
 
 
 @torch.no_grad()
