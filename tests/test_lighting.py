@@ -177,7 +177,7 @@ def test_a_flash_that_pairs_tell_is_no_unknown_light(in_an_environment):
                   in_an_environment.read_text())  # fmt: skip
     pairs.write_text(text.replace('"0 0 0"', '"1 1 1"'))
     capture = mi_ring.load_capture(pairs)
-    assert refined_of(capture, mi_ring.Config(), "capture", 0.5) == ("light", "power")
+    assert refined_of(capture, mi_ring.Config(), "capture", 0.5, False) == ("light", "power")
     with pytest.raises(InputError, match="ambient: is subtracted"):
         mi_ring.choose_lighting(capture, mi_ring.Config.preset("fast", light="auto"))
 
@@ -189,10 +189,10 @@ def test_what_is_refined_is_what_the_capture_leaves_open(small_capture, in_an_en
         (flashed, ("auto", "power"), "lamps", ("light", "power", "ambient")),
         (dark, ("auto",), "capture", ("gain", "ambient")),
     ):
-        assert refined_of(capture, mi_ring.Config(refine=refine), light, 0.5) == refined
+        assert refined_of(capture, mi_ring.Config(refine=refine), light, 0.5, False) == refined
     exact = tuple(replace(shot, calibrated=True) for shot in dark.shots)
     said = with_lighting(replace(dark, shots=exact), Lighting("environment"))
-    assert said.known and refined_of(said, mi_ring.Config(), "environment", 0.5) == ("ambient",)
+    assert said.known and refined_of(said, mi_ring.Config(), "environment", 0.5, False) == ("ambient",)
 
 
 def test_a_dark_room_that_stays_as_it_is_does_not_matter(small_capture, tmp_path):

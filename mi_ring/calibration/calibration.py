@@ -12,12 +12,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from mi_ring.calibration.camera_response import CameraResponse
 from mi_ring.calibration.light_tensors import LightTensors
 from mi_ring.calibration.rig import Estimate, Rig
 from mi_ring.calibration.room_light import RoomLight
-from mi_ring.calibration.unknowns import UNKNOWNS, Unknown, centred
+from mi_ring.calibration.unknown import Unknown
+from mi_ring.calibration.unknowns import UNKNOWNS, centred
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import undistortion_factor
@@ -138,19 +140,26 @@ class Calibration(nn.Module):
         scale = self.value("scale").to(light)
         return light * (scale.detach() - scale).exp()
 
-    def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
-        """Compute the cosine (N, H, W, 1) of the angle between the optical axis and the ray of each pixel.
+    def directions(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
+        """Compute the unit direction (N, H, W, 3) of the ray of each pixel in the camera's axes: left, up, forward.
 
         `index` (N,): indices of the photographs. `scale`: factor by which they are reduced. The result has no gradient.
         """
         width, height = (size // scale for size in self.rig.sizes[index[0]])
         views = self(scale)
         fx, fy, cx, cy = (views.intrinsics[index].detach().T)[..., None, None]
-        x = (torch.arange(width) + 0.5 - cx) / fx
-        y = (torch.arange(height)[:, None] + 0.5 - cy) / fy
-        distance2 = x**2 + y**2
-        distance2 = distance2 * undistortion_factor(views.distortion[index].detach()[:, None, None], distance2) ** 2
-        return (1 + distance2)[..., None] ** -0.5
+        x = (cx - torch.arange(width) - 0.5) / fx
+        y = (cy - torch.arange(height)[:, None] - 0.5) / fy
+        factor = undistortion_factor(views.distortion[index].detach()[:, None, None], x**2 + y**2)
+        x, y = factor * x, factor * y
+        return F.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
+
+    def cosines(self, index: Sequence[int] | np.ndarray, scale: int) -> Tensor:
+        """Compute the cosine (N, H, W, 1) of the angle between the optical axis and the ray of each pixel.
+
+        `index` (N,): indices of the photographs. `scale`: factor by which they are reduced. The result has no gradient.
+        """
+        return self.directions(index, scale)[..., 2:]
 
     def response(self) -> CameraResponse:
         """Return the camera response (vignetting, gains and tone curve) with the current values of the unknowns."""
@@ -247,9 +256,10 @@ class Calibration(nn.Module):
         views = Views(*(part.double().numpy() for part in views))
         shots = []
         for k, shot in enumerate(capture.shots):
+            falloff, left, up = views.cone[k].tolist()
             response = shot.response.changed(gamma, contrast, float(self.value("vignetting")), gains[k])
             shots.append(replace(shot, camera=views.camera(k, shot.size), light=lights[k],
-                                 falloff=float(views.falloff[k]), response=response))  # fmt: skip
+                                 falloff=falloff, tilt=(left, up), response=response))  # fmt: skip
         scene, room = capture.scene, None
         if "lamps" in self.refined:
             scene = with_lamps(scene, lamps._replace(strengths=level * lamps.strengths).lights())

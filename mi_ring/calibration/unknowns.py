@@ -9,102 +9,20 @@ logarithms of `power` and `gain` have mean zero in each colour, and `scale` also
 and scale of the whole scene; focal length and distance; almost also a flash's cone and vignetting.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from mi_ring.calibration.rig import Estimate, LightTensors, Rig
-from mi_ring.capture.capture import Capture
+from mi_ring.calibration.rig import Estimate, Rig
+from mi_ring.calibration.unknown import Found, Unknown
 from mi_ring.geometry.rotations import rotations
-from mi_ring.scene.shot import Shot
 
 VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measured
-
-
-class Found(NamedTuple):
-    """The capture before and after a fit, and other values from which unknowns describe their results."""
-
-    rig: Rig
-    before: Capture  #: as the capture says
-    after: Capture  #: as found
-    power: float  #: factor of all lights' strengths that was found
-    lamps: LightTensors  #: the scene's own lamps as found
-    several: bool  #: Are the photographs' lights the first of several unknown lamps?
-
-    def means(self, of: Callable[[Shot], float]) -> tuple[float, float]:
-        """Return the mean of the number `of(shot)` over all photographs: (before the fit, after the fit)."""
-        before, after = (float(np.mean([of(shot) for shot in side.shots])) for side in (self.before, self.after))
-        return before, after
-
-
-@dataclass(frozen=True)
-class Unknown(ABC):
-    """Base class of the unknowns of calibration.
-
-    It has `components` numbers per photograph, lens, light or lamp, or for the whole capture; `per` says which.
-    """
-
-    name: str
-    option: str  #: of `--refine`
-    width: float  #: standard deviation of the prior, in the unknown's own unit
-    per: Literal["capture", "photograph", "lens", "light", "lamp"]
-    components: int = 1
-    own_lights: bool = False  #: Is it a property of the photographs' own lights?
-
-    #: What it changes in a picture. view: how things are seen and lit; recording: only how that is recorded; light: the
-    #: photograph's own light by a factor of each colour; gain: the same of all that is recorded; indirect: only that.
-    changes: ClassVar[Literal["view", "recording", "light", "gain", "indirect"]] = "view"
-    solved: ClassVar[bool] = False  #: Has it a solver in `fitting`? Others follow their gradient by Adam.
-
-    def shape(self, rig: Rig) -> tuple[int, ...]:
-        """Return the shape of the parameter: (number of photographs, lenses, lights or lamps; components).
-
-        The first number is missing if `per` is "capture". The second is missing if there is one component.
-        """
-        several = () if self.per == "capture" else (rig.count(self.per),)
-        return several + (self.components,) * (self.components > 1)
-
-    def width_for(self, rig: Rig) -> float:
-        """Return the standard deviation of the prior for this rig, in the unknown's own unit."""
-        return self.width
-
-    def rows(self, rig: Rig, index: np.ndarray) -> list[np.ndarray]:
-        """Find the rows of the parameter that affect the photographs `index` (n,).
-
-        Returns a list of arrays (n,), each with one row number per photograph. For an unknown of lamps, the list has
-        one array for each lamp, because all lamps light every photograph. For all other unknowns it has one array.
-        """
-        if self.per == "lamp":  # all lamps light all photographs
-            return [np.full_like(index, k) for k in range(rig.count("lamp"))]
-        numbers = {"lens": rig.lens, "light": rig.place}
-        if self.per in numbers:
-            return [numbers[self.per][index].numpy()]
-        return [index if self.per == "photograph" else np.zeros_like(index)]
-
-    @abstractmethod
-    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        """Return the estimate `now`, changed by this unknown. `value`: its current value, in the unknown's own unit."""
-
-    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any] | None:
-        """Describe the result of the fit: (meaning in words, value before the fit, value after, standard deviation).
-
-        Returns None if each photograph has its own value. `value`, `std`: final value and standard deviation, in the
-        unknown's own unit.
-        """
-        return None
-
-    def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any] | None:
-        """Describe the result for one photograph: (key in calibration.json, value, standard deviation).
-
-        Returns None if photographs share the unknown. `value`, `std`: final value and standard deviation for this
-        photograph, in the unknown's own unit.
-        """
-        return None
 
 
 class Turn(Unknown):
@@ -216,11 +134,27 @@ class Power(Exposure):
 class Falloff(Unknown):
     """Correction that is added to the cosine exponent of the flash's cone. It makes the flash darker off its axis."""
 
+    solved = True
+
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        return now.seen(falloff=now.views.falloff + value)
+        return now.seen(cone=now.views.cone + torch.cat([value[None], torch.zeros(2)]))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         return "exponent of the flash's cone", *found.means(lambda shot: shot.falloff), std
+
+
+class Tilt(Unknown):
+    """Correction that is added to the tilt of the flash's cone, to the left and up in the axes of an upright camera."""
+
+    solved = True
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return now.seen(cone=now.views.cone + F.pad(rig.held[:, :2, :2] @ value, (1, 0)))
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        held = found.rig.held[0, :2, :2].numpy()
+        before, after = (held.T @ side.shots[0].tilt for side in (found.before, found.after))
+        return "tilt of the flash's cone, to the left and up", before, after, std
 
 
 class Vignetting(Unknown):
@@ -323,7 +257,8 @@ UNKNOWNS: dict[str, Unknown] = {unknown.name: unknown for unknown in (
     Distortion("distortion", "distortion", 0.05, "lens"),
     LightPlace("light", "light", 0.1, "light", 3, own_lights=True),
     Power("power", "power", 0.1, "photograph", 3, own_lights=True),
-    Falloff("falloff", "falloff", 1.0, "capture", own_lights=True),
+    Falloff("falloff", "falloff", 5.0, "capture", own_lights=True),
+    Tilt("tilt", "falloff", 1.0, "capture", 2, own_lights=True),
     Vignetting("vignetting", "vignetting", 1.0, "capture"),
     CurveExponent("curve", "curve", 0.2, "capture"),
     Contrast("contrast", "contrast", 0.2, "capture"),

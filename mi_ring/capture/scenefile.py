@@ -29,7 +29,7 @@ OPTIONAL = {
     "vignetting": ("response.vignetting", 0.0), "distortion": ("camera.distortion", 0.0),
 }  # fmt: skip
 #: Properties of a photograph, beside its light, that a fit may refine.
-REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", *OPTIONAL}
+REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", "tilt", *OPTIONAL}
 
 
 def photograph_element(shot: Shot) -> Element:
@@ -50,8 +50,9 @@ def photograph_element(shot: Shot) -> Element:
             fields[field] = value
     for field, value in fields.items():
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
-    if response.gain != (1, 1, 1):
-        ElementTree.SubElement(element, "string", name="gain", value=numbers(response.gain))
+    for field, several in (("gain", response.gain), ("tilt", shot.tilt)):
+        if several not in ((1, 1, 1), (0, 0)):
+            ElementTree.SubElement(element, "string", name=field, value=numbers(several))
     if shot.calibrated:
         ElementTree.SubElement(element, "boolean", name="calibrated", value="true")
     add_pose(element, camera.to_world)

@@ -49,7 +49,8 @@ class Common:
     auto: one of these four. The background of the photographs and coarse fits tell which. This takes longer."""
     refine: tuple[Unknown, ...] = ("auto",)
     """Calibration that the fit corrects, in addition to surface and material. Initial values come from the scene file.
-    auto: light, power, ambient. Also scale, if with these lights the object would reflect more light than it gets.
+    auto: light, power, ambient. Also falloff, for a flash that moves with the camera; and scale, if with these lights
+    the object would reflect more light than it gets.
     With another --light than capture, auto is gain and ambient; for lamps also light and lamps.
     none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto cameras focal.
     cameras: position and direction of each camera.
@@ -59,7 +60,8 @@ class Common:
     lamps: position and intensity of the point and directional emitters outside <sensor>: they light all photographs.
     power: intensity and colour of the light of each photograph. Give it if the flash varied.
     gain: exposure and white balance of each photograph. Give it instead of power if the camera's exposure varied.
-    falloff: how fast the light of the flash decreases away from the axis of the flash.
+    falloff: the cone of a flash that moves with the camera: how fast its light decreases to the sides, and where it
+    points.
     vignetting: how much darker the lens makes the corners of the image.
     curve, contrast: exponent of the camera's response curve, and steepness of its S shape.
     scale: one factor for the intensities of all lights. The fit finds it from interreflection.

@@ -160,7 +160,8 @@ def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
         lights = [Light("point", shot.camera.position, np.zeros(3)) for shot in capture.shots]
     shots = []
     for shot, light, gain in zip(capture.shots, lights, gains):
-        shots.append(replace(shot, light=light, falloff=0.0, response=shot.response.changed(gain=gain)))
+        response = shot.response.changed(gain=gain)
+        shots.append(replace(shot, light=light, falloff=0.0, tilt=(0.0, 0.0), response=response))
     return replace(capture, scene=scene, shots=tuple(shots), room=room)
 
 

@@ -6,15 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from mi_ring.calibration.calibration import OPTIONS
+from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.problem import Problem
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.scene.lights import shared_emitters
 
-#: What `--refine auto` stands for; `scale` is added where the lights' intensities cannot be true. Of a flash it refines
-#: the place beside the lens: a flash farther ahead looks like a darker surface. Not `curve`: it looks like another
-#: reflectance, too (docs: phone captures).
+#: What `--refine auto` stands for; `falloff` is added for a flash that moves with the camera, `scale` where the lights'
+#: intensities cannot be true. Of a flash it refines the place beside the lens: a flash farther ahead looks like a
+#: darker surface. Not `curve`: it looks like another reflectance, too (docs: phone captures).
 AUTO = "light", "power", "ambient"
 #: What is refined under each kind of unknown light.
 UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
@@ -37,7 +38,8 @@ class Refinement(NamedTuple):
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo = math.pi * reflectance
-        refined = refined_of(problem.seen, problem.config, problem.lighting.kind, albedo)
+        moves = Rig(problem.seen, center, problem.exposure).flash is not None
+        refined = refined_of(problem.seen, problem.config, problem.lighting.kind, albedo, moves)
         return cls(reflectance, refined, albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0)
 
     @property
@@ -46,11 +48,11 @@ class Refinement(NamedTuple):
         return math.pi * self.reflectance
 
 
-def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> tuple[str, ...]:
+def refined_of(capture: Capture, config: Config, light: str, albedo: float, flash: bool) -> tuple[str, ...]:
     """List the values of `--refine` that a fit refines, in a fixed order. The capture decides what `auto` means.
 
     `light`: kind of the light, such as "capture" or "lamps". `albedo`: of the object, computed from the lights'
-    strengths.
+    strengths. `flash`: the lights are one flash that moves with the camera.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known
@@ -60,7 +62,7 @@ def refined_of(capture: Capture, config: Config, light: str, albedo: float) -> t
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
         subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
-        names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
+        names |= {*AUTO, *({"falloff"} if flash else set())} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
     return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mi_ring.calibration.unknowns import Exposure, Found, centred
+from mi_ring.calibration.unknown import Found
+from mi_ring.calibration.unknowns import Exposure, centred
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem

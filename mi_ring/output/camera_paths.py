@@ -149,7 +149,7 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
     if config.light_orbit and not light.rgb.any():
         raise InputError(f"{config.scene}: --light-orbit: the photographs have no light of their own to move; "
                          "give --turntable")  # fmt: skip
-    views, digits = [], max(3, len(str(count - 1)))
+    views, digits, nowhere = [], max(3, len(str(count - 1))), Files(Path("none"))
     for k in range(count):
         seen_from, lit_from, time = camera, light, config.time
         if config.turntable:
@@ -167,8 +167,9 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
         else:
             time = k / max(count - 1, 1)
         name = f"{k:0{digits}}.{config.format or 'png'}"
-        falloff = 0.0 if config.light_orbit else shot.falloff  # about the axis of the camera
-        views.append(RenderedView(Shot("view", seen_from, lit_from, falloff, files=Files(Path("none"))), name, time))
+        # about the axis of the camera
+        falloff, tilt = (0.0, (0.0, 0.0)) if config.light_orbit else (shot.falloff, shot.tilt)
+        views.append(RenderedView(Shot("view", seen_from, lit_from, falloff, tilt, files=nowhere), name, time))
     return views
 
 

@@ -87,8 +87,9 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
     valid = None if shown.all() else write_binary("valid", shown)
     camera = posed.lens.camera(posed.pose)
     camera = camera._replace(centre=camera.centre - [left, top], size=(width, height))
-    return photograph_element(Shot(picture.name, camera, posed.light, posed.falloff, Response(posed.gamma),
-                                   Files(filename, mask, valid), encoding, picture.saturation))  # fmt: skip
+    files = Files(filename, mask, valid)
+    return photograph_element(Shot(picture.name, camera, posed.light, posed.falloff, response=Response(posed.gamma),
+                                   files=files, encoding=encoding, saturation=picture.saturation))  # fmt: skip
 
 
 def write_table(

@@ -16,13 +16,13 @@ def flash_light(it, sample=(0, 0), active=True):
     """
     if Photograph.current is None:
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
-    light, falloff = Photograph.current.light, Photograph.current.falloff
+    light, cone = Photograph.current.light, Photograph.current.cone
     ds, weight = light.sample_direction(it, mi.Point2f(sample), active)
     if mi.has_flag(light.flags(), mi.EmitterFlags.Infinite):  # a nested emitter does not know the size of the scene
         ds.dist = mi.Float(DISTANT)
         ds.p = it.p + DISTANT * ds.d
     else:
-        weight = weight * flash_falloff(ds.d, Photograph.current.to_world.matrix, falloff)
+        weight = weight * flash_falloff(ds.d, Photograph.current.to_world.matrix, cone)
     return ds, dr.select(it.time == SHUTTER, weight, 0)
 
 

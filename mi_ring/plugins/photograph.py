@@ -53,6 +53,10 @@ class Photograph(mi.Sensor):
     ``falloff``      float        exponent of the flash's cone: a point light shines in a direction by   P, ∂
                                   its intensity times the cosine between this direction and where the
                                   camera looks, to this power. Default: 0, the same in all directions
+    ``tilt``         string       direction in which the flash shines more strongly than in others: a    P, ∂
+                                  point light's intensity is multiplied by exp(a x + b y). a and b are
+                                  the two numbers; x and y are the components of the unit direction
+                                  from the light, to the camera's left and up. Default: 0 0
     ``calibrated``   boolean      true: camera and light are exact, so a fit does not refine them unless
                                   its options say so. Default: false
     (nested)         film         its size is the image's; exposed as ``film``                           P
@@ -120,6 +124,8 @@ class Photograph(mi.Sensor):
             raise ValueError(f'{what}: gain is "{props["gain"]}", must be above 0')
         self.response = Response(*curve, vignetting, tuple(np.broadcast_to(gain, 3).tolist()))
         self.falloff = mi.Float(number(props, "falloff", 0.0))
+        tilt = number_list(props, "tilt", (2,)) if "tilt" in props else (0.0, 0.0)
+        self.tilt = mi.Point2f(*tilt)
         self.calibrated = props.get("calibrated", False)
 
         width, height = (int(s) for s in self.film().size())
@@ -136,9 +142,10 @@ class Photograph(mi.Sensor):
             raise ValueError(f"{what}: {len(lights)} nested emitters, must be at most one")
         position = [float(v) for v in matrix[:3, 3]]
         self.light = lights[0] if lights else mi.load_dict({"type": "point", "position": position, "intensity": 1.0})
-        if self.light.class_name() != "PointLight" and "falloff" in props:
-            raise ValueError(f"{what}: falloff is for point lights, not for {self.light.class_name()}")
-        dr.make_opaque(self.focal, self.centre, self.to_world, self.falloff, self.distortion)
+        for name in ("falloff", "tilt"):
+            if self.light.class_name() != "PointLight" and name in props:
+                raise ValueError(f"{what}: {name} is for point lights, not for {self.light.class_name()}")
+        dr.make_opaque(self.focal, self.centre, self.to_world, self.falloff, self.tilt, self.distortion)
 
     @property
     def camera(self) -> Camera:
@@ -155,9 +162,14 @@ class Photograph(mi.Sensor):
         """
         if (kind := self.light.class_name()) not in LAMP_CLASSES:
             raise SceneError(f'photograph "{self.id()}": nested emitter is a {kind}, must be "point" or "directional"')
-        falloff = float(np.ravel(self.falloff)[0])
-        return Shot(self.id(), self.camera, light_of(self.light), falloff, self.response, self.files, self.encoding,
-                    self.saturation, self.calibrated)  # fmt: skip
+        falloff, left, up = (float(np.ravel(part)[0]) for part in (self.falloff, self.tilt.x, self.tilt.y))
+        return Shot(self.id(), self.camera, light_of(self.light), falloff, (left, up), self.response, self.files,
+                    self.encoding, self.saturation, self.calibrated)  # fmt: skip
+
+    @property
+    def cone(self):
+        """The numbers (Vector3f) of the flash's cone: its exponent, and its tilt to the left and up."""
+        return mi.Vector3f(self.falloff, self.tilt.x, self.tilt.y)
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
         Photograph.current = self
@@ -178,12 +190,13 @@ class Photograph(mi.Sensor):
         callback.put("centre", self.centre, mi.ParamFlags.Differentiable)
         callback.put("distortion", self.distortion, mi.ParamFlags.Differentiable)
         callback.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
+        callback.put("tilt", self.tilt, mi.ParamFlags.Differentiable)
         callback.put("light", self.light, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys):
         super().parameters_changed(keys)
         # Dr.Jit gives literals, which are shared, the size of a call that reads them.
-        dr.make_opaque(self.falloff, self.distortion)
+        dr.make_opaque(self.falloff, self.tilt, self.distortion)
 
     def to_string(self):
         return f"Photograph[filename={self.files.filename}, size={self.camera.size}]"

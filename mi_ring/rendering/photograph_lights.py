@@ -113,15 +113,16 @@ class Lights:
         return self.rgb() / distance2[:, None]
 
 
-def flash_falloff(direction, to_world, falloff):
-    """Compute the factor by which a flash is weaker away from its axis: cosine ^ `falloff`, 1 on the axis.
+def flash_falloff(direction, to_world, cone):
+    """Compute the factor of a flash's intensity in a direction: cosine ^ n · exp(a x + b y).
 
-    The cosine is of the angle between the axis and the direction from the flash to the surface. `direction`: unit
-    vector from the surface to the flash. `to_world`: pose of the camera, whose optical axis is the axis of the flash.
-    `falloff`: exponent; 0: the flash is equal in all directions.
+    x, y and the cosine are the components of the direction from the flash to the surface in the axes of the camera:
+    left, up and forward. `direction`: unit vector from the surface to the flash. `to_world`: pose of the camera.
+    `cone` (Vector3f): the exponent n, and the tilts a and b. All are 0 for a flash that is equal in all directions. A
+    cone of exponent n whose axis is turned by a small angle has a tilt of about n times this angle.
     """
-    cosine = -dr.dot(direction, mi.Vector3f(to_world[0, 2], to_world[1, 2], to_world[2, 2]))
-    return dr.power(dr.maximum(cosine, MIN_FLASH_COSINE), falloff)
+    x, y, cosine = (-dr.dot(direction, mi.Vector3f(to_world[0, k], to_world[1, k], to_world[2, k])) for k in range(3))
+    return dr.power(dr.maximum(cosine, MIN_FLASH_COSINE), cone.x) * dr.exp(cone.y * x + cone.z * y)
 
 
 def toward(light: Light) -> np.ndarray:

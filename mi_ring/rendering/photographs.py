@@ -59,7 +59,7 @@ class Photographs:
         light = Lights.attached(sensor.light)
         views = Views(
             dr.concat([mi.Float(m[i, j]) for i in range(3) for j in range(4)]),
-            dr.concat([*sensor.focal, *sensor.centre]), light.places, light.strengths, mi.Float(sensor.falloff),
+            dr.concat([*sensor.focal, *sensor.centre]), light.places, light.strengths, dr.concat([*sensor.cone]),
             mi.Float(sensor.distortion),
         )  # fmt: skip
         return replace(cls.of([sensor.shot]), views=views)
@@ -130,9 +130,9 @@ class Photographs:
         """
         k = dr.gather(mi.UInt32, self.index, view)
         ds, radiance = self.lights.sample(k, si)
-        if self.views.falloff is not None:
+        if self.views.cone is not None:
             finite = dr.gather(mi.Bool, self.finite, k)
-            share = flash_falloff(ds.d, self.camera(view).to_world, dr.gather(mi.Float, self.views.falloff, k))
+            share = flash_falloff(ds.d, self.camera(view).to_world, dr.gather(mi.Vector3f, self.views.cone, k))
             radiance *= dr.select(finite, share, 1)
         return ds, radiance
 

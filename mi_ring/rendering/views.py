@@ -18,7 +18,7 @@ class Views(NamedTuple):
     intrinsics: Any  #: (P, 4) fx, fy, cx, cy [px]
     places: Any  #: (P, 3) of lights: positions [scene units], of distant ones unit directions toward them
     strengths: Any  #: (P, 3) intensities, of distant lights irradiances
-    falloff: Any  #: (P,) exponents of the flashes' cones; as a buffer None if all are 0
+    cone: Any  #: (P, 3) of the flashes: exponents of cones, tilts to the left and up; as a buffer None if all are 0
     distortion: Any  #: (P,) first radial distortions of the lenses; as a buffer None if all are 0
 
     @classmethod
@@ -32,7 +32,8 @@ class Views(NamedTuple):
         return cls(
             np.stack([camera.to_world[:3] for camera in cameras]),
             np.array([[*camera.focal, *camera.centre] for camera in cameras]), places, strengths,
-            np.array([shot.falloff for shot in shots]), np.array([camera.distortion for camera in cameras]),
+            np.array([(shot.falloff, *shot.tilt) for shot in shots]),
+            np.array([camera.distortion for camera in cameras]),
         )  # fmt: skip
 
     def to(self, device: Any) -> "Views":
@@ -40,9 +41,9 @@ class Views(NamedTuple):
         return Views(*(tensor.to(device) for tensor in self))
 
     def buffers(self) -> "Views":
-        """Convert NumPy arrays to flat Dr.Jit buffers of float32. `falloff` and `distortion` become None if all 0."""
+        """Convert NumPy arrays to flat Dr.Jit buffers of float32. `cone` and `distortion` become None if all 0."""
         buffers = {name: to_flat(mi.Float, array) for name, array in self._asdict().items()}
-        return Views(**buffers | {name: None for name in ("falloff", "distortion") if not getattr(self, name).any()})
+        return Views(**buffers | {name: None for name in ("cone", "distortion") if not getattr(self, name).any()})
 
     def camera(self, k: int, size: tuple[int, int]) -> Camera:
         """Return the camera of photograph `k`. `size`: (width, height) of the picture [px]. For NumPy arrays only."""

@@ -86,6 +86,7 @@ class Shot:
     camera: Camera
     light: Light | None = None  #: its own light, which lights no other photograph; None: see `own_light`
     falloff: float = 0.0  #: exponent of the cosine between the direction from a point light and where the camera looks
+    tilt: tuple[float, float] = (0.0, 0.0)  #: logarithm of the factor by which it is stronger to the left, and up
     response: Response = Response()
     files: Files = NO_FILES
     encoding: Encoding = "auto"  #: of the photograph's file

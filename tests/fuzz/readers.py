@@ -340,7 +340,8 @@ def scene(folder: Path) -> Reader:
     poses = ["-1 0 0 0  0 1 0 0  0 0 -1 5  0 0 0 1", "1 0 0 0  0 1 0 0  0 0 1 -5  0 0 0 1"]
     more = ['<string name="mask" value="mask.png"/><string name="encoding" value="srgb"/>'
             '<float name="saturation" value="0.9"/><float name="gamma" value="1.1"/>'
-            '<float name="falloff" value="2"/><float name="vignetting" value="1.5"/>', ""]  # fmt: skip
+            '<float name="falloff" value="2"/><string name="tilt" value="1 -0.5"/>'
+            '<float name="vignetting" value="1.5"/>', ""]  # fmt: skip
     sensors = [SENSOR.format(id=f"{k:03}", fx=9.0, fy=9.5, cx=3.3, cy=2.2, matrix=poses[k], width=W, height=H,
                              mask=more[k], x=1, y=0.5, z=5 - 10 * k, intensity=25) for k in range(2)]  # fmt: skip
     path = folder / "scene.xml"
