@@ -31,7 +31,7 @@ from mi_ring.fitting.renderer import Renderer
 from mi_ring.system.machine import threads_of
 
 folder, scene = sys.argv[1:3]
-refine = ("cameras", "light", "power", "ambient")
+refine = ("cameras", "light", "power", "falloff", "ambient")
 small = {"levels": (2,), "widths": (28,), "shares": (1.0,), "domain": "sphere", "refine": refine,
          "precision": "float32"}
 
@@ -49,9 +49,10 @@ def step(fit):
     optimisation.backward = noting
     fit.course.iteration = fit.iterations // 2
     it = fit.step()
-    exposure, pose = optimisation.solvers
+    exposure, cone, pose = optimisation.solvers
     seen = [value for _, value in exposure.seen]
     found |= {"powers": torch.stack(seen) if seen else torch.zeros(1), "curvature": pose.seen[1],
+              "cone": cone.state[calibration.falloff]["equations"],
               "room": calibration.room.vector, "loss": torch.tensor(it.loss),
               "terms": torch.tensor([it.terms.get(name, 0.0) for name in fit.loss.terms]),
               "unexplained": torch.tensor(it.unexplained()),

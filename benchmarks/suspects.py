@@ -1,0 +1,187 @@
+"""What faults of real photographs cost: each is imitated alone in a capture with known truth.
+
+    python benchmarks/suspects.py CAPTURE [--out out/suspects] [--only NAME…] [OPTIONS OF mi-ring fit]
+
+CAPTURE is a folder with scene.xml and truth/mesh.ply, whose flash is at the lens. The photographs are changed after
+rendering, so interreflection is not quite right. Every other photograph is one capture of the object, the others are a
+second one. Both are fitted, by what `auto` refined before it refined the flash's cone, and by a cure.
+
+Prints a Markdown table with machine and date: mean error of the normals against the truth (of both captures), and mean
+and median angle between the normals of both surfaces at the nearest points. The same command continues after an
+interruption.
+"""
+
+import argparse
+import datetime
+import io
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import trimesh
+from accuracy import processor, product_speed, table
+from halves import fitted, half
+from PIL import Image
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mi_ring.capture.scenefile import move_names, numbers
+from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.images import linear_to_srgb
+
+BEFORE = "light", "power", "ambient"  #: what `auto` refined before the cone
+POINTS, NEAR = 40_000, 0.01  #: of each surface; pairs of points farther apart do not count [diagonal]
+
+
+class Lens(NamedTuple):
+    """Directions of a photograph's pixels in the camera's axes, each (H, W), and random numbers of the photograph."""
+
+    left: np.ndarray
+    up: np.ndarray
+    forward: np.ndarray
+    random: np.random.Generator
+
+
+def same(values: np.ndarray, lens: Lens) -> np.ndarray:
+    """Change nothing."""
+    return values
+
+
+def narrow(values: np.ndarray, lens: Lens) -> np.ndarray:
+    """Light like a narrow flash that points down, as that of two real captures does."""
+    return values * (lens.forward**38 * np.exp(-6 * lens.up) * 1.3)[..., None]
+
+
+def compressed(values: np.ndarray) -> np.ndarray:
+    """Encoded values after JPEG of low quality."""
+    file = io.BytesIO()
+    Image.fromarray((255 * values.clip(0, 1) + 0.5).astype(np.uint8)).save(file, "JPEG", quality=40)
+    return np.asarray(Image.open(file), np.float64) / 255
+
+
+def blocky(mask: np.ndarray) -> np.ndarray:
+    """A mask (H, W) of whole blocks of 8 pixels."""
+    height, width = mask.shape
+    blocks = mask.reshape(height // 8, 8, width // 8, 8).mean((1, 3)) > 64
+    return np.kron(blocks, np.full((8, 8), 255)).astype(np.uint8)
+
+
+def moved(pose: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """A pose (4, 4) turned by about 0.1° and moved by about 0.2 % of a distance of 135."""
+    pose = pose.copy()
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(0.1) * random.normal(size=3)).as_matrix()
+    pose[:3, 3] += 0.002 * 135 * random.normal(size=3)
+    return pose
+
+
+class Suspect(NamedTuple):
+    """A fault, and the values of `--refine` that should cure it."""
+
+    cure: tuple[str, ...] = ("auto",)
+    radiance: Callable[[np.ndarray, Lens], np.ndarray] = same  #: of linear values (H, W, 3)
+    encoded: Callable[[np.ndarray], np.ndarray] = lambda values: values
+    mask: Callable[[np.ndarray], np.ndarray] = lambda mask: mask
+    pose: Callable[[np.ndarray, np.random.Generator], np.ndarray] = lambda pose, random: pose
+
+
+SUSPECTS = {
+    "none": Suspect(),
+    "narrow flash": Suspect(radiance=narrow),
+    "clipped": Suspect(radiance=lambda values, lens: 3 * values),
+    "exposures ± 15 %": Suspect(radiance=lambda values, lens: values * np.exp(0.15 * lens.random.normal())),
+    "curve": Suspect(("auto", "curve"), encoded=lambda v: linear_to_srgb(srgb_to_linear(v) ** 1.2)),
+    "JPEG": Suspect(encoded=compressed),
+    "blocky masks": Suspect(("auto", "masks"), mask=blocky),
+    "poses": Suspect(("auto", "cameras"), pose=moved),
+}
+
+
+def write(capture: Path, folder: Path, suspect: Suspect) -> Path:
+    """The capture with a fault, in a folder. Returns its scene file."""
+    scene = folder / "scene.xml"
+    if scene.exists():
+        return scene
+    root = ElementTree.parse(capture / "scene.xml").getroot()
+    for number, sensor in enumerate(root.findall("sensor")):
+        random = np.random.default_rng(number)
+        name, mask = (sensor.find(f"string[@name='{key}']") for key in ("filename", "mask"))
+        fx, fy, cx, cy = (float(sensor.find(f"float[@name='{key}']").get("value")) for key in ("fx", "fy", "cx", "cy"))
+        values = np.asarray(Image.open(capture / name.get("value")).convert("RGB"), np.float64) / 255
+        y, x = np.mgrid[: len(values), : values.shape[1]] + 0.5
+        rays = np.stack([(cx - x) / fx, (cy - y) / fy, np.ones_like(x)])
+        lens = Lens(*(rays / np.linalg.norm(rays, axis=0)), random)
+        values = suspect.encoded(linear_to_srgb(suspect.radiance(srgb_to_linear(values), lens).clip(0, 1)))
+        silhouette = suspect.mask(np.asarray(Image.open(capture / mask.get("value")).convert("L")))
+        for element, picture in ((name, (255 * values.clip(0, 1) + 0.5).astype(np.uint8)), (mask, silhouette)):
+            path = folder / element.get("value")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(picture).save(path)
+        matrix = sensor.find("transform/matrix")
+        pose = suspect.pose(np.array(matrix.get("value").split(), float).reshape(4, 4), random)
+        matrix.set("value", numbers(pose.ravel()))
+        point = sensor.find("emitter/point")  # the flash is at the lens
+        for axis, value in zip("xyz", pose[:3, 3]):
+            point.set(axis, str(value))
+    move_names(root, folder, folder)
+    scene.write_bytes(ElementTree.tostring(root))
+    return scene
+
+
+def angles(one: Path, other: Path) -> np.ndarray:
+    """Angles [degrees] between the normals of two meshes in the same frame, at nearest points."""
+    sides = []
+    for path in (one, other):
+        mesh = trimesh.load(path, process=False)
+        points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
+        weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
+        normals = (mesh.vertex_normals[mesh.faces[faces]] * weights[..., None]).sum(1)
+        sides.append((points, normals / np.linalg.norm(normals, axis=1, keepdims=True)))
+    (a, of_a), (b, of_b) = sides
+    distance, nearest = cKDTree(a).query(b)
+    near = distance < NEAR * np.linalg.norm(np.ptp(a, 0))
+    return np.degrees(np.arccos((of_b * of_a[nearest]).sum(1).clip(-1, 1)))[near]
+
+
+def measured(scene: Path, truth: Path, refine: tuple[str, ...], options: list[str]) -> str:
+    """The cell of a table: fits of both halves of the photographs."""
+    outs, errors = [], []
+    for which in (0, 1):
+        path = scene.parent / f"{which}.xml"
+        half(scene, which, path)
+        out = scene.parent / "-".join([str(which), *refine])
+        fitted(path, out, ["--refine", *refine, *options])
+        command = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth), "--spp", "1", "--align",
+                   "rigid"]  # fmt: skip
+        errors.append(json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)["normal_mean"])
+        outs.append(out / "mesh.ply")
+    apart = angles(*outs)
+    return f"{np.mean(errors):.2f}°, {apart.mean():.2f}° / {np.median(apart):.2f}°"
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("out/suspects"))
+    parser.add_argument("--only", nargs="+", choices=SUSPECTS, default=[*SUSPECTS])
+    arguments, options = parser.parse_known_args()
+    rows, truth = [], arguments.capture / "truth/mesh.ply"
+    for name in arguments.only:
+        suspect = SUSPECTS[name]
+        scene = write(arguments.capture, arguments.out / name.replace(" ", "_").replace("%", ""), suspect)
+        cells = [measured(scene, truth, refine, options) for refine in (BEFORE, suspect.cure)]
+        rows.append([name, cells[0], f"`{' '.join(suspect.cure)}`", cells[1]])
+        print(*rows[-1], file=sys.stderr, flush=True)
+    speed = product_speed(4096, 4096, torch.float32) / 1e9
+    print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
+    print(table(["fault", f"`{' '.join(BEFORE)}`: error, apart", "cure", "error, apart"], rows))
+
+
+if __name__ == "__main__":
+    main()
