@@ -35,7 +35,7 @@ class Task:
     """Continue an interrupted fit from the checkpoint in its results folder. Give the same options as before."""
     preset: Literal["fast", "default", "fine", "paper"] = "default"
     """A set of values for the other options. Options that you give override it. Times are for two processor cores.
-    fast: a preview in one minute. default: good results in five minutes. fine: more detail in half an hour.
+    fast: a preview in two minutes. default: good results in ten minutes. fine: more detail in half an hour.
     paper: the paper's own settings, seven hours."""
     minutes: float = 0
     """Time that the whole command may take, approximately [min], for example 10. 0: no limit.

@@ -52,7 +52,7 @@ def step(fit):
     exposure, cone, pose = optimisation.solvers
     seen = [value for _, value in exposure.seen]
     found |= {"powers": torch.stack(seen) if seen else torch.zeros(1), "curvature": pose.seen[1],
-              "cone": cone.state[calibration.falloff]["equations"],
+              "cone": cone.moments,
               "room": calibration.room.vector, "loss": torch.tensor(it.loss),
               "terms": torch.tensor([it.terms.get(name, 0.0) for name in fit.loss.terms]),
               "unexplained": torch.tensor(it.unexplained()),

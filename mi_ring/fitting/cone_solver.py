@@ -1,7 +1,7 @@
 """Solves for the cone of a flash, from how brightness differs within each photograph.
 
 The logarithm of a flash's intensity is linear in the numbers of its cone: exponent and tilt. So least squares determine
-them. Adam is too slow: the flash of a camera may have an exponent of 20, a bare one of 0.
+them. Adam is too slow: a narrow flash has an exponent of 40, one without a cone 0.
 """
 
 import torch
@@ -13,11 +13,11 @@ from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.refinement import START
 from mi_ring.fitting.schedule import Rate
 
-MEMORY = 0.95  #: factor per iteration of earlier normal equations, which belong to an earlier surface
-ERROR = 0.15  #: standard deviation of the logarithm of predicted brightness
-INDEPENDENT = 30  #: as many pixels of a photograph have errors that do not depend on each other
-MOST = 0.5  #: larger errors count as this: highlights, shadows
-UNKNOWNS = "falloff", "tilt"
+FEWEST = 10  #: photographs that must have been seen: fewer do not show how much their errors differ
+MOST = 0.5  #: larger errors of logarithms count as this: highlights, shadows
+AIMED = 0.1  #: standard deviation of the axis' direction [rad]: of the tilt, relative to the exponent
+LEAST_TILT = 0.1  #: standard deviation of the tilt of a flash that has no cone yet
+RIDGE = 1e-6  #: that is added to the diagonal of the normal equations, relative to it
 
 
 class ConeSolver(torch.optim.Optimizer):
@@ -28,57 +28,93 @@ class ConeSolver(torch.optim.Optimizer):
     def __init__(self, calibration: Calibration) -> None:
         """Solve for the cone of a calibration's flash."""
         self.calibration = calibration
-        self.tensors = [getattr(calibration, name) for name in UNKNOWNS]
+        self.falloff: Tensor = getattr(calibration, "falloff")  # noqa: B009  (for types)
+        self.tilt: Tensor = getattr(calibration, "tilt")  # noqa: B009
         self.widths = torch.tensor([calibration.widths[name] for name in ("falloff", "tilt", "tilt")])
-        super().__init__([{"params": self.tensors}], {"lr": self.rate.initial})
-        #: normal equations (4, 5) for the numbers of the cone and a factor of the contrast, and the right side
-        self.state[self.tensors[0]] = {"equations": torch.zeros(4, 5)}
+        super().__init__([{"params": [self.falloff, self.tilt]}], {"lr": self.rate.initial})
+        #: of each photograph, when it was last seen: means of products of the five columns with these and the error
+        self.state[self.falloff] = {"moments": torch.zeros(len(calibration.rig), 5, 6)}
+
+    @property
+    def moments(self) -> Tensor:
+        """(P, 5, 6): the last five columns are those of `columns`, first the cone's; 0 if a photograph was not seen."""
+        return self.state[self.falloff]["moments"]
 
     def numbers(self) -> Tensor:
         """Return exponent and tilts (3,) as corrections of the capture's, in their own units."""
-        return torch.cat([tensor.detach().reshape(-1) for tensor in self.tensors]) * self.widths
+        return torch.cat([self.falloff.detach().reshape(1), self.tilt.detach()]) * self.widths
 
     @torch.no_grad()
     def look(self, it: Iteration) -> None:
-        """Add the photographs of an iteration to the normal equations.
+        """Compare observed and predicted brightness of the pixels of each photograph of an iteration.
 
-        They compare logarithms of observed and predicted brightness of pixels in the same photograph, so its exposure
-        does not matter. The cone must explain what a factor of the contrast does not: surfaces that are darker at
-        grazing angles than predicted look like a cone.
+        Only differences within a photograph count, so its exposure does not matter.
         """
         if it.progress < START or it.stage.settles:
             return
-        index, scale, held = it.batch.photographs, it.batch.scale, self.calibration.rig.held[it.batch.photographs]
-        directions = self.calibration.directions(index, scale)
-        across = torch.einsum("nji,nhwj->nhwi", held[:, :2, :2], directions[..., :2])
-        features = torch.cat([directions[..., 2:].log(), across], -1)
+        index, held = it.batch.photographs, self.calibration.rig.held[it.batch.photographs][:, :2, :2]
+        directions = self.calibration.directions(index, it.batch.scale)
         pixels = it.object_pixels() & ~it.observation.clipped.any(-1)
         observed, predicted = it.observation.rgb.mean(-1), it.prediction.rgb.mean(-1)
         pixels &= torch.minimum(observed, predicted) > BLACK * it.context.exposure
-        equations = torch.zeros(4, 5)
+        found = torch.zeros(len(index), 5, 6)
         for n, inside in enumerate(pixels.cpu()):
-            if int(inside.sum()) < ENOUGH:
-                continue
-            seen, shown = (light[n].cpu()[inside].log() for light in (observed, predicted))
-            columns = torch.column_stack([features[n][inside], shown, seen - shown])
-            columns -= columns.mean(0)
-            columns[:, -1].clamp_(-MOST, MOST)
-            columns[:, -1] += columns[:, :3] @ self.numbers()  # as if the prediction were without the cone
-            equations += columns[:, :-1].T @ columns / len(columns)
-        if not bool((equations := it.batch.share.sum(equations)).isfinite().all()):
-            return
-        state = self.state[self.tensors[0]]
-        state["equations"] = MEMORY * state["equations"] + equations
+            if int(inside.sum()) >= ENOUGH:
+                seen, shown = (light[n].cpu()[inside].log() for light in (observed, predicted))
+                features = columns(directions[n][inside], held[n], shown)
+                error = (seen - shown) - (seen - shown).mean()
+                # Plus the cone that the prediction has already, so that the solution is the whole cone.
+                error = error.clamp(-MOST, MOST) + features[:, :3] @ self.numbers()
+                found[n] = features.T @ torch.column_stack([features, error]) / len(features)
+        found = it.batch.share.gathered(found)
+        for k, moments in zip(it.batch.all_photographs.tolist(), found):
+            if moments.isfinite().all() and moments.any():
+                self.moments[k] = moments
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Move the estimates toward the solution of the normal equations, with their priors. Does nothing at first."""
+        """Move the estimates toward the solution. Does nothing before ten photographs have been seen."""
         (group,) = self.param_groups
-        equations = self.state[self.tensors[0]]["equations"]
-        if not equations.any():
+        now, known = self.numbers(), self.moments[self.moments.any(2).any(1)].double()
+        if len(known) < FEWEST:
             return
-        prior = torch.cat([self.widths, torch.ones(1)]) ** -2 * (ERROR**2 / INDEPENDENT)
-        solution = torch.linalg.solve(equations[:, :-1] + prior.diag(), equations[:, -1])[:3]
-        change = group["lr"] * (solution - self.numbers()) / self.widths
-        for tensor, part in zip(self.tensors, change.split([1, 2])):
-            tensor += part.reshape(tensor.shape)
+        solution, covariance = least_squares(known)
+        given = float(self.calibration.rig.views.cone[:, 0].mean())
+        aimed = max(AIMED * abs(given + float(now[0])), LEAST_TILT)
+        prior = torch.tensor([float(self.widths[0]), aimed, aimed]).double().square().diag()
+        solution = prior @ torch.linalg.solve(prior + covariance[:3, :3], solution[:3])
+        solution[0] = solution[0].clamp(min=-given)  # no flash is brighter at its sides
+        change = group["lr"] * (solution.float() - now) / self.widths
+        self.falloff += change[0]
+        self.tilt += change[1:]
+
+
+def columns(directions: Tensor, held: Tensor, shown: Tensor) -> Tensor:
+    """Make the columns (n, 5) that explain the errors of n pixels of a photograph, each with mean 0.
+
+    The first three are those of the cone: logarithm of the cosine to the optical axis, directions to the left and up.
+    The others explain what looks like a cone: `shown` (n,), the logarithm of predicted brightness, for an error of the
+    contrast; and the square of the distance from the middle of the object, for rims that are too bright or too dark.
+    `directions` (n, 3): of the pixels' rays in the camera's axes. `held` (2, 2): turns the axes of an upright camera
+    into those of this one.
+    """
+    middle = directions[:, :2] - directions[:, :2].mean(0)
+    away = middle.square().sum(1)
+    result = torch.column_stack([directions[:, 2].log(), directions[:, :2] @ held, shown, away / away.mean()])
+    return result - result.mean(0)
+
+
+def least_squares(moments: Tensor) -> tuple[Tensor, Tensor]:
+    """Solve least squares with k unknowns. Returns (solution (k,), covariance (k, k)).
+
+    `moments` (P, k, k + 1): normal equations of each of P photographs, with the right side last. The errors of pixels
+    of one photograph may depend on each other, so the covariance follows from how much photographs differ
+    (cluster-robust: "Longitudinal data analysis using generalized linear models", Liang and Zeger 1986).
+    """
+    equations = moments.sum(0)
+    matrix = equations[:, :-1]
+    inverse = torch.linalg.inv(matrix + RIDGE * matrix.diagonal().diag())
+    solution = inverse @ equations[:, -1]
+    scores = moments[..., -1] - moments[..., :-1] @ solution
+    count, unknowns = scores.shape
+    return solution, inverse @ (scores.T @ scores) @ inverse * (count / (count - unknowns))
