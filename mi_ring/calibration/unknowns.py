@@ -23,7 +23,6 @@ from mi_ring.calibration.unknown import Found, Unknown
 from mi_ring.geometry.rotations import rotations
 
 VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measured
-MEASURED = 5.0  #: of a flash whose cone is known, the prior's width is divided by this
 
 
 class Turn(Unknown):
@@ -136,9 +135,6 @@ class Falloff(Unknown):
     """Correction that is added to the cosine exponent of the flash's cone. It makes the flash darker off its axis."""
 
     solved = True
-
-    def width_for(self, rig: Rig) -> float:
-        return self.width / (MEASURED if rig.views.cone.any() else 1.0)
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return now.seen(cone=now.views.cone + torch.cat([value[None], torch.zeros(2)]))

@@ -13,8 +13,8 @@ from mi_ring.fitting.problem import Problem
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.scene.lights import shared_emitters
 
-#: What `--refine auto` stands for; `falloff` is added for a flash that moves with the camera, `scale` where the lights'
-#: intensities cannot be true. Of a flash it refines the place beside the lens: a flash farther ahead looks like a
+#: What `--refine auto` stands for; `falloff` is added for a flash that moves with the camera and has no
+#: known cone, `scale` where the lights' intensities cannot be true. Of a flash it refines the place beside the lens: a flash farther ahead looks like a
 #: darker surface. Not `curve`: it looks like another reflectance, too (docs: phone captures).
 AUTO = "light", "power", "ambient"
 #: What is refined under each kind of unknown light.
@@ -38,8 +38,9 @@ class Refinement(NamedTuple):
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo = math.pi * reflectance
-        moves = Rig(problem.seen, center, problem.exposure).flash is not None
-        refined = refined_of(problem.seen, problem.config, problem.lighting.kind, albedo, moves)
+        rig = Rig(problem.seen, center, problem.exposure)
+        open_cone = rig.flash is not None and not rig.views.cone.any()
+        refined = refined_of(problem.seen, problem.config, problem.lighting.kind, albedo, open_cone)
         return cls(reflectance, refined, albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0)
 
     @property
@@ -48,11 +49,11 @@ class Refinement(NamedTuple):
         return math.pi * self.reflectance
 
 
-def refined_of(capture: Capture, config: Config, light: str, albedo: float, flash: bool) -> tuple[str, ...]:
+def refined_of(capture: Capture, config: Config, light: str, albedo: float, open_cone: bool) -> tuple[str, ...]:
     """List the values of `--refine` that a fit refines, in a fixed order. The capture decides what `auto` means.
 
     `light`: kind of the light, such as "capture" or "lamps". `albedo`: of the object, computed from the lights'
-    strengths. `flash`: the lights are one flash that moves with the camera.
+    strengths. `open_cone`: the lights are one flash that moves with the camera, whose cone the capture does not tell.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known
@@ -62,7 +63,9 @@ def refined_of(capture: Capture, config: Config, light: str, albedo: float, flas
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
         subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
-        names |= {*AUTO, *({"falloff"} if flash else set())} - subtracted - ({"power"} if "gain" in names else set())
+        names |= (
+            {*AUTO, *({"falloff"} if open_cone else set())} - subtracted - ({"power"} if "gain" in names else set())
+        )
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
     return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))
