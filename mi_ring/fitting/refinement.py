@@ -13,9 +13,9 @@ from mi_ring.fitting.problem import Problem
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.scene.lights import shared_emitters
 
-#: What `--refine auto` stands for; `falloff` is added for a flash that moves with the camera and has no
-#: known cone, `scale` where the lights' intensities cannot be true. Of a flash it refines the place beside the lens: a flash farther ahead looks like a
-#: darker surface. Not `curve`: it looks like another reflectance, too (docs: phone captures).
+#: What `--refine auto` stands for; `falloff` is added for a flash that moves with the camera and has no known cone,
+#: `scale` where the lights' intensities cannot be true. Of a flash it refines the place beside the lens: a flash farther
+#: ahead looks like a darker surface. Not `curve`: it looks like another reflectance, too (docs: phone captures).
 AUTO = "light", "power", "ambient"
 #: What is refined under each kind of unknown light.
 UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
@@ -63,9 +63,8 @@ def refined_of(capture: Capture, config: Config, light: str, albedo: float, open
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
         subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
-        names |= (
-            {*AUTO, *({"falloff"} if open_cone else set())} - subtracted - ({"power"} if "gain" in names else set())
-        )
+        names |= {"falloff"} if open_cone else set()
+        names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
     return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))
