@@ -277,11 +277,16 @@ def test_the_power_that_is_refined_begins_with_a_usual_albedo(broken_capture):
     assert np.pi * float(fit.ring.brdf_net.scale) == pytest.approx(0.5 * factor, rel=1e-4)
 
 
-def test_what_is_refined_on_demand_goes_with_auto(small_capture):
+def test_what_is_refined_on_demand_goes_with_auto(small_capture, tmp_path):
     capture = mi_ring.load_capture(small_capture)
     assert refined_of(capture, Config(refine=("auto", "contrast")), "capture", 0.5, True) == (
         "light", "power", "falloff", "contrast", "ambient")  # fmt: skip
     assert refined_of(capture, Config(), "capture", 0.5, False) == ("light", "power", "ambient")
+    known = edited(small_capture, tmp_path / "known", lambda element: ElementTree.SubElement(
+        element, "string", name="tilt", value="0 -1"))  # fmt: skip
+    for scene, refined in ((small_capture, True), (known, False)):  # a cone that the scene file tells is known
+        fit = Fit(mi_ring.load_capture(scene), Config(domain="sphere"))
+        assert ("falloff" in fit.model.calibration.refined) == refined
     assert "scale" in refined_of(capture, Config(), "capture", 1.5, True)
     assert "scale" not in refined_of(capture, Config(), "capture", 0.5, True)
     with pytest.raises(InputError, match="none alone"):
