@@ -74,7 +74,7 @@ def test_a_cone_is_found_whatever_each_photographs_exposure(fit, cone):
     exponent, left, up = cone
     exposures = torch.linspace(0.6, 1.8, 12)[:, None, None]
     photographed = exposures * texture(fit) * cosine**exponent * (left * x + up * y).exp()
-    found = solved(fit, texture(fit), photographed, discs(fit, 0.4) < 1, noise=0.03)
+    found = solved(fit, texture(fit), photographed, discs(fit, 0.4) < 1, noise=0.02)
     np.testing.assert_allclose(found, cone, rtol=0.05, atol=0.2)
 
 

@@ -17,6 +17,9 @@ FEWEST = 10  #: photographs that must have been seen: fewer do not show how much
 MOST = 0.5  #: larger errors of logarithms count as this: highlights, shadows
 AIMED = 0.1  #: standard deviation of the axis' direction [rad]: of the tilt, relative to the exponent
 LEAST_TILT = 0.1  #: standard deviation of the tilt of a flash that has no cone yet
+#: Other errors of the model may look like a cone that explains this much, relative to the variance that remains: light
+#: from a table, a wrong material.
+DOUBT = 0.05
 RIDGE = 1e-6  #: that is added to the diagonal of the normal equations, relative to it
 
 
@@ -32,12 +35,12 @@ class ConeSolver(torch.optim.Optimizer):
         self.tilt: Tensor = getattr(calibration, "tilt")  # noqa: B009
         self.widths = torch.tensor([calibration.widths[name] for name in ("falloff", "tilt", "tilt")])
         super().__init__([{"params": [self.falloff, self.tilt]}], {"lr": self.rate.initial})
-        #: of each photograph, when it was last seen: means of products of the five columns with these and the error
-        self.state[self.falloff] = {"moments": torch.zeros(len(calibration.rig), 5, 6)}
+        #: of each photograph, when it was last seen: means of products of the five columns and the error
+        self.state[self.falloff] = {"moments": torch.zeros(len(calibration.rig), 6, 6)}
 
     @property
     def moments(self) -> Tensor:
-        """(P, 5, 6): the last five columns are those of `columns`, first the cone's; 0 if a photograph was not seen."""
+        """(P, 6, 6): the columns are those of `columns`, first the cone's; then the error. 0: not seen yet."""
         return self.state[self.falloff]["moments"]
 
     def numbers(self) -> Tensor:
@@ -57,7 +60,7 @@ class ConeSolver(torch.optim.Optimizer):
         pixels = it.object_pixels() & ~it.observation.clipped.any(-1)
         observed, predicted = it.observation.rgb.mean(-1), it.prediction.rgb.mean(-1)
         pixels &= torch.minimum(observed, predicted) > BLACK * it.context.exposure
-        found = torch.zeros(len(index), 5, 6)
+        found = torch.zeros(len(index), 6, 6)
         for n, inside in enumerate(pixels.cpu()):
             if int(inside.sum()) >= ENOUGH:
                 seen, shown = (light[n].cpu()[inside].log() for light in (observed, predicted))
@@ -65,7 +68,8 @@ class ConeSolver(torch.optim.Optimizer):
                 error = (seen - shown) - (seen - shown).mean()
                 # Plus the cone that the prediction has already, so that the solution is the whole cone.
                 error = error.clamp(-MOST, MOST) + features[:, :3] @ self.numbers()
-                found[n] = features.T @ torch.column_stack([features, error]) / len(features)
+                both = torch.column_stack([features, error])
+                found[n] = both.T @ both / len(both)
         found = it.batch.share.gathered(found)
         for k, moments in zip(it.batch.all_photographs.tolist(), found):
             if moments.isfinite().all() and moments.any():
@@ -78,11 +82,18 @@ class ConeSolver(torch.optim.Optimizer):
         now, known = self.numbers(), self.moments[self.moments.any(2).any(1)].double()
         if len(known) < FEWEST:
             return
-        solution, covariance = least_squares(known)
+        solution, covariance = least_squares(known[:, :-1])
+        remaining = known[:, -1].sum(0) @ torch.cat([-solution, torch.ones(1)])
+        # Of the cone alone: what the other columns explain as well is not counted.
+        matrix = known[:, :-1, :-1].sum(0)
+        others = matrix[3:, :3]
+        own = matrix[:3, :3] - others.T @ torch.linalg.solve(matrix[3:, 3:], others)
+        explained = solution[:3] @ own @ solution[:3]
         given = float(self.calibration.rig.views.cone[:, 0].mean())
         aimed = max(AIMED * abs(given + float(now[0])), LEAST_TILT)
         prior = torch.tensor([float(self.widths[0]), aimed, aimed]).double().square().diag()
         solution = prior @ torch.linalg.solve(prior + covariance[:3, :3], solution[:3])
+        solution *= (1 - DOUBT * remaining / explained).clamp(min=0)  # as James and Stein 1961
         solution[0] = solution[0].clamp(min=-given)  # no flash is brighter at its sides
         change = group["lr"] * (solution.float() - now) / self.widths
         self.falloff += change[0]

@@ -15,7 +15,7 @@ from mi_ring.scene.lights import shared_emitters
 
 #: What `--refine auto` stands for; `falloff` is added for a flash that moves with the camera and has no known cone,
 #: `scale` where the lights' intensities cannot be true. Of a flash it refines the place beside the lens: a flash
-#: farther ahead looks like a darker surface. Not `curve`: it looks like another reflectance, too (docs: phone captures).
+#: farther ahead looks like a darker surface. Not `curve`: it looks like another reflectance, too.
 AUTO = "light", "power", "ambient"
 #: What is refined under each kind of unknown light.
 UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
