@@ -36,7 +36,7 @@ def half(scene: Path, which: int, path: Path) -> None:
 
 def fitted(scene: Path, out: Path, options: list[str]) -> dict:
     """What a fit has refined; it is not made again if there is one by these options."""
-    note = out.with_suffix(".txt")
+    note = out.parent / f"{out.name}.txt"
     if not (out / "report.html").exists() or not note.exists() or note.read_text() != " ".join(options):
         note.unlink(missing_ok=True)
         command = [sys.executable, "-m", "mi_ring.fit", str(scene), "--out", str(out), *options]

@@ -3,8 +3,8 @@
     python benchmarks/suspects.py CAPTURE [--out out/suspects] [--only NAME…] [OPTIONS OF mi-ring fit]
 
 CAPTURE is a folder with scene.xml and truth/mesh.ply, whose flash is at the lens. The photographs are changed after
-rendering, so interreflection is not quite right. Every other photograph is one capture of the object, the others are a
-second one. Both are fitted, by what `auto` refined before it refined the flash's cone, and by a cure.
+rendering; interreflection is not changed with them. Every other photograph is one capture of the object, the others are
+a second one. Each is fitted twice: with `--refine light power ambient`, and with options that should cure the fault.
 
 Prints a Markdown table with machine and date: mean error of the normals against the truth (of both captures), and mean
 and median angle between the normals of both surfaces at the nearest points. The same command continues after an
@@ -15,6 +15,7 @@ import argparse
 import datetime
 import io
 import json
+import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -35,7 +36,7 @@ from mi_ring.capture.scenefile import move_names, numbers
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.images import linear_to_srgb
 
-BEFORE = "light", "power", "ambient"  #: what `auto` refined before the cone
+BEFORE = "light", "power", "ambient"  #: what `--refine auto` is without the cone
 POINTS, NEAR = 40_000, 0.01  #: of each surface; pairs of points farther apart do not count [diagonal]
 
 
@@ -68,15 +69,16 @@ def compressed(values: np.ndarray) -> np.ndarray:
 def blocky(mask: np.ndarray) -> np.ndarray:
     """A mask (H, W) of whole blocks of 8 pixels."""
     height, width = mask.shape
-    blocks = mask.reshape(height // 8, 8, width // 8, 8).mean((1, 3)) > 64
-    return np.kron(blocks, np.full((8, 8), 255)).astype(np.uint8)
+    padded = np.pad(mask, ((0, -height % 8), (0, -width % 8)))
+    blocks = padded.reshape(len(padded) // 8, 8, -1, 8).mean((1, 3)) > 64
+    return np.kron(blocks, np.full((8, 8), 255)).astype(np.uint8)[:height, :width]
 
 
 def moved(pose: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """A pose (4, 4) turned by about 0.1° and moved by about 0.2 % of a distance of 135."""
+    """A pose (4, 4) turned by about 0.1° and moved by about 0.2 % of the distance from the origin."""
     pose = pose.copy()
     pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(0.1) * random.normal(size=3)).as_matrix()
-    pose[:3, 3] += 0.002 * 135 * random.normal(size=3)
+    pose[:3, 3] += 0.002 * np.linalg.norm(pose[:3, 3]) * random.normal(size=3)
     return pose
 
 
@@ -174,7 +176,7 @@ def main() -> None:
     rows, truth = [], arguments.capture / "truth/mesh.ply"
     for name in arguments.only:
         suspect = SUSPECTS[name]
-        scene = write(arguments.capture, arguments.out / name.replace(" ", "_").replace("%", ""), suspect)
+        scene = write(arguments.capture, arguments.out / arguments.capture.name / re.sub(r"\W+", "_", name), suspect)
         cells = [measured(scene, truth, refine, options) for refine in (BEFORE, suspect.cure)]
         rows.append([name, cells[0], f"`{' '.join(suspect.cure)}`", cells[1]])
         print(*rows[-1], file=sys.stderr, flush=True)

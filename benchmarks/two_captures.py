@@ -64,7 +64,7 @@ def main() -> None:
     speed = product_speed(4096, 4096, torch.float32) / 1e9
     print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
     normals = f"{apart['normal_mean']:.2f}° / {apart['normal_median']:.2f}°"
-    print(table(["captures", "cone and tilt", "the same", "normals, mean / median", "surfaces"],
+    print(table(["captures", "cone, tilt of the first", "of the second", "normals, mean / median", "surfaces"],
                 [[" and ".join(source.name for source in arguments.captures), *map(cone, records), normals,
                   f"{apart['distance_mean']:.3f} %"]]))  # fmt: skip
 

@@ -15,6 +15,7 @@ from mi_ring.rendering.views import Views
 from mi_ring.scene.assembly import lamp_lights
 
 RIGID = 0.02  #: how much a flash may move in the cameras' axes and still be one flash [rig's distance]
+BESIDE = 0.35  #: how far from the optical axis a light can still be the flash of a camera [rig's distance]
 INSIDE = 0.999  #: share of the range in which a lens distortion can be inverted
 
 
@@ -104,6 +105,22 @@ class Rig:
         several = {"photograph": len(self), "lens": int(self.lens.max()) + 1, "light": int(self.place.max()) + 1,
                    "lamp": len(self.lamps.places)}  # fmt: skip
         return several[per]
+
+    @property
+    def open_cone(self) -> bool:
+        """True if the lights are one flash beside the lens, and the capture does not tell its cone."""
+        return self.flash is not None and float(self.upright[:2].norm()) < BESIDE * self.distance and not bool(
+            self.views.cone.any())  # fmt: skip
+
+    @property
+    def turned(self) -> bool:
+        """True if cameras were held upright and on their side, and the place of the flash does not tell which.
+
+        Then its tilt is not the same in the axes of all cameras.
+        """
+        width, height = (self.frames[:, 1] - self.frames[:, 0]).T
+        same = bool((self.held == torch.eye(3)).all())
+        return same and bool((width > height).any()) and bool((width < height).any())
 
     def estimate(self) -> Estimate:
         """Return an estimate that equals the capture: no offset of a light, and all factors 1."""

@@ -8,7 +8,8 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from mi_ring.calibration.rig import Estimate, LightTensors, Rig
+from mi_ring.calibration.light_tensors import LightTensors
+from mi_ring.calibration.rig import Estimate, Rig
 from mi_ring.capture.capture import Capture
 from mi_ring.scene.shot import Shot
 

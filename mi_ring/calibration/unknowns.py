@@ -132,28 +132,35 @@ class Power(Exposure):
 
 
 class Falloff(Unknown):
-    """Correction that is added to the cosine exponent of the flash's cone. It makes the flash darker off its axis."""
+    """Correction that is added to the cosine exponent of the flash's cone. Gradients ignore it.
+
+    It makes the flash darker off its axis.
+    """
 
     solved = True
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        return now.seen(cone=now.views.cone + torch.cat([value[None], torch.zeros(2)]))
+        return now.seen(cone=now.views.cone + torch.cat([value.detach()[None], torch.zeros(2)]))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         return "exponent of the flash's cone", *found.means(lambda shot: shot.falloff), std
 
 
 class Tilt(Unknown):
-    """Correction that is added to the tilt of the flash's cone, to the left and up in the axes of an upright camera."""
+    """Correction that is added to the tilt of the flash's cone. Gradients ignore it.
+
+    Its numbers are to the left and up in the axes of the first photograph's camera.
+    """
 
     solved = True
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        return now.seen(cone=now.views.cone + F.pad(rig.held[:, :2, :2] @ value, (1, 0)))
+        return now.seen(cone=now.views.cone + F.pad(rig.held[:, :2, :2] @ value.detach(), (1, 0)))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        held = found.rig.held[0, :2, :2].numpy()
-        before, after = (held.T @ side.shots[0].tilt for side in (found.before, found.after))
+        held = found.rig.held[:, :2, :2].numpy()
+        before, after = (np.einsum("pji,pj->pi", held, [shot.tilt for shot in side.shots]).mean(0)
+                         for side in (found.before, found.after))  # fmt: skip
         return "tilt of the flash's cone, to the left and up", before, after, std
 
 

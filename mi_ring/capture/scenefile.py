@@ -50,9 +50,10 @@ def photograph_element(shot: Shot) -> Element:
             fields[field] = value
     for field, value in fields.items():
         ElementTree.SubElement(element, "float", name=field, value=numbers(value))
-    for field, several in (("gain", response.gain), ("tilt", shot.tilt)):
-        if several not in ((1, 1, 1), (0, 0)):
-            ElementTree.SubElement(element, "string", name=field, value=numbers(several))
+    if response.gain != (1, 1, 1):
+        ElementTree.SubElement(element, "string", name="gain", value=numbers(response.gain))
+    if shot.tilt != (0, 0):
+        ElementTree.SubElement(element, "string", name="tilt", value=numbers(shot.tilt))
     if shot.calibrated:
         ElementTree.SubElement(element, "boolean", name="calibrated", value="true")
     add_pose(element, camera.to_world)

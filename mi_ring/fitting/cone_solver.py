@@ -10,17 +10,16 @@ from torch import Tensor
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.fitting.exposure_solver import BLACK, ENOUGH
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.refinement import START
+from mi_ring.fitting.refinement import FEWEST, START
 from mi_ring.fitting.schedule import Rate
 
-FEWEST = 10  #: photographs that must have been seen: fewer do not show how much their errors differ
-MOST = 0.5  #: larger errors of logarithms count as this: highlights, shadows
-AIMED = 0.1  #: standard deviation of the axis' direction [rad]: of the tilt, relative to the exponent
-LEAST_TILT = 0.1  #: standard deviation of the tilt of a flash that has no cone yet
-#: Other errors of the model may look like a cone that explains this much, relative to the variance that remains: light
-#: from a table, a wrong material.
+MOST = 0.5  #: errors of logarithms are cut to ± this, so that highlights and shadows do not decide
+AIMED = 0.1  #: prior of the tilt, relative to the exponent: how uncertain the flash's axis is [rad]
+LEAST_TILT = 0.1  #: and at least this
+#: A cone must explain more than this share of the variance that remains: light from a table, or a wrong material, may
+#: explain as much.
 DOUBT = 0.05
-RIDGE = 1e-6  #: that is added to the diagonal of the normal equations, relative to it
+RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
 
 
 class ConeSolver(torch.optim.Optimizer):
@@ -31,8 +30,7 @@ class ConeSolver(torch.optim.Optimizer):
     def __init__(self, calibration: Calibration) -> None:
         """Solve for the cone of a calibration's flash."""
         self.calibration = calibration
-        self.falloff: Tensor = getattr(calibration, "falloff")  # noqa: B009  (for types)
-        self.tilt: Tensor = getattr(calibration, "tilt")  # noqa: B009
+        self.falloff, self.tilt = (calibration.get_parameter(name) for name in ("falloff", "tilt"))
         self.widths = torch.tensor([calibration.widths[name] for name in ("falloff", "tilt", "tilt")])
         super().__init__([{"params": [self.falloff, self.tilt]}], {"lr": self.rate.initial})
         #: of each photograph, when it was last seen: means of products of the five columns and the error
@@ -65,9 +63,9 @@ class ConeSolver(torch.optim.Optimizer):
             if int(inside.sum()) >= ENOUGH:
                 seen, shown = (light[n].cpu()[inside].log() for light in (observed, predicted))
                 features = columns(directions[n][inside], held[n], shown)
-                error = (seen - shown) - (seen - shown).mean()
+                error = ((seen - shown) - (seen - shown).mean()).clamp(-MOST, MOST)
                 # Plus the cone that the prediction has already, so that the solution is the whole cone.
-                error = error.clamp(-MOST, MOST) + features[:, :3] @ self.numbers()
+                error = error - error.mean() + features[:, :3] @ self.numbers()
                 both = torch.column_stack([features, error])
                 found[n] = both.T @ both / len(both)
         found = it.batch.share.gathered(found)
@@ -77,7 +75,7 @@ class ConeSolver(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Move the estimates toward the solution. Does nothing before ten photographs have been seen."""
+        """Move the estimates toward the solution. Does nothing before `FEWEST` photographs have been seen."""
         (group,) = self.param_groups
         now, known = self.numbers(), self.moments[self.moments.any(2).any(1)].double()
         if len(known) < FEWEST:
@@ -85,19 +83,21 @@ class ConeSolver(torch.optim.Optimizer):
         solution, covariance = least_squares(known[:, :-1])
         remaining = known[:, -1].sum(0) @ torch.cat([-solution, torch.ones(1)])
         # Of the cone alone: what the other columns explain as well is not counted.
-        matrix = known[:, :-1, :-1].sum(0)
+        matrix = damped(known[:, :-1, :-1].sum(0))
         others = matrix[3:, :3]
         own = matrix[:3, :3] - others.T @ torch.linalg.solve(matrix[3:, 3:], others)
-        explained = solution[:3] @ own @ solution[:3]
-        given = float(self.calibration.rig.views.cone[:, 0].mean())
-        aimed = max(AIMED * abs(given + float(now[0])), LEAST_TILT)
+        explained = float(solution[:3] @ own @ solution[:3])
+        share = max(0.0, 1 - DOUBT * max(float(remaining), 0.0) / explained) if explained > 0 else 0.0
+        rig = self.calibration.rig
+        given = float(rig.views.cone[:, 0].mean())
+        aimed = 0.0 if rig.turned else max(AIMED * abs(given + float(now[0])), LEAST_TILT)
         prior = torch.tensor([float(self.widths[0]), aimed, aimed]).double().square().diag()
-        solution = prior @ torch.linalg.solve(prior + covariance[:3, :3], solution[:3])
-        solution *= (1 - DOUBT * remaining / explained).clamp(min=0)  # as James and Stein 1961
+        solution = prior @ torch.linalg.solve(damped(prior + covariance[:3, :3]), solution[:3])
+        solution *= share  # "Estimation with quadratic loss", James and Stein 1961
         solution[0] = solution[0].clamp(min=-given)  # no flash is brighter at its sides
         change = group["lr"] * (solution.float() - now) / self.widths
-        self.falloff += change[0]
-        self.tilt += change[1:]
+        self.falloff.add_(change[0])
+        self.tilt.add_(change[1:])
 
 
 def columns(directions: Tensor, held: Tensor, shown: Tensor) -> Tensor:
@@ -115,6 +115,11 @@ def columns(directions: Tensor, held: Tensor, shown: Tensor) -> Tensor:
     return result - result.mean(0)
 
 
+def damped(matrix: Tensor) -> Tensor:
+    """Return a symmetric matrix (k, k) with a larger diagonal, so that it has an inverse."""
+    return matrix + (RIDGE * matrix.diagonal() + FLOOR).diag()
+
+
 def least_squares(moments: Tensor) -> tuple[Tensor, Tensor]:
     """Solve least squares with k unknowns. Returns (solution (k,), covariance (k, k)).
 
@@ -124,7 +129,7 @@ def least_squares(moments: Tensor) -> tuple[Tensor, Tensor]:
     """
     equations = moments.sum(0)
     matrix = equations[:, :-1]
-    inverse = torch.linalg.inv(matrix + RIDGE * matrix.diagonal().diag())
+    inverse = torch.linalg.inv(damped(matrix))
     solution = inverse @ equations[:, -1]
     scores = moments[..., -1] - moments[..., :-1] @ solution
     count, unknowns = scores.shape

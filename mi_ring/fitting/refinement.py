@@ -19,6 +19,7 @@ from mi_ring.scene.lights import shared_emitters
 AUTO = "light", "power", "ambient"
 #: What is refined under each kind of unknown light.
 UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
+FEWEST = 10  #: photographs that tell a cone: fewer do not show how much their errors differ
 START = 0.2  #: progress of the fit at which refinement begins
 
 
@@ -38,8 +39,8 @@ class Refinement(NamedTuple):
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo = math.pi * reflectance
-        rig = Rig(problem.seen, center, problem.exposure)
-        open_cone = rig.flash is not None and not rig.views.cone.any()
+        rig = Rig(problem.capture, center, problem.exposure)
+        open_cone = rig.open_cone and len(problem.fitted) >= FEWEST
         refined = refined_of(problem.seen, problem.config, problem.lighting.kind, albedo, open_cone)
         return cls(reflectance, refined, albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0)
 
@@ -53,7 +54,7 @@ def refined_of(capture: Capture, config: Config, light: str, albedo: float, open
     """List the values of `--refine` that a fit refines, in a fixed order. The capture decides what `auto` means.
 
     `light`: kind of the light, such as "capture" or "lamps". `albedo`: of the object, computed from the lights'
-    strengths. `open_cone`: the lights are one flash that moves with the camera, whose cone the capture does not tell.
+    strengths. `open_cone`: photographs can tell the cone of the flash, and the capture does not tell it.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known
@@ -63,7 +64,7 @@ def refined_of(capture: Capture, config: Config, light: str, albedo: float, open
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
         subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
-        names |= {"falloff"} if open_cone else set()
+        names |= {"falloff"} if open_cone and "vignetting" not in names else set()
         names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")

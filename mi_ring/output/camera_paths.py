@@ -167,7 +167,7 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
         else:
             time = k / max(count - 1, 1)
         name = f"{k:0{digits}}.{config.format or 'png'}"
-        # about the axis of the camera
+        # The cone is fixed to the camera, so a light that moves by itself has none.
         falloff, tilt = (0.0, (0.0, 0.0)) if config.light_orbit else (shot.falloff, shot.tilt)
         views.append(RenderedView(Shot("view", seen_from, lit_from, falloff, tilt, files=nowhere), name, time))
     return views

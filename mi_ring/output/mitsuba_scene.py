@@ -43,8 +43,8 @@ def write_scene(
     """Write a scene with the textured object, and camera and light of a photograph. Returns the paths of its files.
 
     `path`: the XML file; the other files lie beside it. `texels`: the N points with values, and which of them each
-    texel shows. `values`: BSDF parameters (N, 3) or (N,) by name. `bsdf`: Mitsuba's XML. `shot`: the photograph. `room`
-    (BASIS, 3): room light, spherical harmonics; it becomes an environment map if the photograph has no light. None: no
+    texel shows. `values`: BSDF parameters (N, 3) or (N,) by name. `bsdf`: Mitsuba's XML. `shot`: the photograph. The
+    cone of its flash is left out. `room` (BASIS, 3): room light, spherical harmonics; it becomes an environment map if the photograph has no light. None: no
     room light.
     """
     files = [path]

@@ -53,10 +53,10 @@ class Photograph(mi.Sensor):
     ``falloff``      float        exponent of the flash's cone: a point light shines in a direction by   P, ∂
                                   its intensity times the cosine between this direction and where the
                                   camera looks, to this power. Default: 0, the same in all directions
-    ``tilt``         string       direction in which the flash shines more strongly than in others: a    P, ∂
-                                  point light's intensity is multiplied by exp(a x + b y). a and b are
-                                  the two numbers; x and y are the components of the unit direction
-                                  from the light, to the camera's left and up. Default: 0 0
+    ``tilt``         string       two numbers a and b: the flash is brighter to one side. A point        P, ∂
+                                  light's intensity is multiplied by exp(a x + b y); x and y are the
+                                  components of the unit direction from the light, to the camera's
+                                  left and up. Default: 0 0
     ``calibrated``   boolean      true: camera and light are exact, so a fit does not refine them unless
                                   its options say so. Default: false
     (nested)         film         its size is the image's; exposed as ``film``                           P

@@ -86,7 +86,7 @@ class Shot:
     camera: Camera
     light: Light | None = None  #: its own light, which lights no other photograph; None: see `own_light`
     falloff: float = 0.0  #: exponent of the cosine between the direction from a point light and where the camera looks
-    tilt: tuple[float, float] = (0.0, 0.0)  #: logarithm of the factor by which it is stronger to the left, and up
+    tilt: tuple[float, float] = (0.0, 0.0)  #: (a, b): a point light has a factor exp(a x + b y) to the left x, up y
     response: Response = Response()
     files: Files = NO_FILES
     encoding: Encoding = "auto"  #: of the photograph's file
