@@ -44,8 +44,8 @@ def write_scene(
 
     `path`: the XML file; the other files lie beside it. `texels`: the N points with values, and which of them each
     texel shows. `values`: BSDF parameters (N, 3) or (N,) by name. `bsdf`: Mitsuba's XML. `shot`: the photograph. The
-    cone of its flash is left out. `room` (BASIS, 3): room light, spherical harmonics; it becomes an environment map if the photograph has no light. None: no
-    room light.
+    cone of its flash is left out. `room` (BASIS, 3): room light, spherical harmonics; it becomes an environment map if
+    the photograph has no light. None: no room light.
     """
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
