@@ -171,6 +171,14 @@ def test_path_tracer_sees_the_flashs_cone_as_photometric_does():
     assert pictures[2.5, "path"].mean() != pytest.approx(pictures[0.0, "path"].mean(), rel=0.05)
 
 
+@pytest.mark.parametrize(("tilt", "limit"), [("1", "2 numbers"), ("nan 1", "2 numbers"), ("0 -51", "from -50 to 50")])
+def test_a_tilt_that_is_none_is_refused(small_capture, tmp_path, tilt, limit):
+    scene = edited(small_capture, tmp_path / "tilted", lambda element: ElementTree.SubElement(
+        element, "string", name="tilt", value=tilt))  # fmt: skip
+    with pytest.raises(InputError, match=f'photograph "000": tilt is "{tilt}", must be {limit}'):
+        mi_ring.load_capture(scene)
+
+
 def test_lens_gain_and_curve_are_undone_in_a_file_that_they_made(small_capture):
     """v = (R · g · cosⁿ)^γ, cosine by hand, logarithms of g of mean 0. What a fit predicts is what such a
     file says, decoded without.

@@ -13,6 +13,7 @@ from mi_ring.scene.shot import Files, Response, Shot
 
 #: Time of a photograph's rays. Other sensors have times of 0 and later: by the time the flash tells them apart.
 SHUTTER = -1.0
+STEEPEST = 50  #: tilt of a flash: exp of much more is infinite in float32
 
 
 class Photograph(mi.Sensor):
@@ -125,6 +126,8 @@ class Photograph(mi.Sensor):
         self.response = Response(*curve, vignetting, tuple(np.broadcast_to(gain, 3).tolist()))
         self.falloff = mi.Float(number(props, "falloff", 0.0))
         tilt = number_list(props, "tilt", (2,)) if "tilt" in props else (0.0, 0.0)
+        if max(map(abs, tilt)) > STEEPEST:
+            raise ValueError(f'{what}: tilt is "{props["tilt"]}", must be from -{STEEPEST} to {STEEPEST}')
         self.tilt = mi.Point2f(*tilt)
         self.calibrated = props.get("calibrated", False)
 
