@@ -34,7 +34,8 @@ class Setting:
         self.shadows, self.unit = shadows, unit
         sensors = {f"sensor{k}": self.photograph(k, light) for k, light in enumerate(lights)}
         ball = {"type": "shapenet", "id": "ball", "subdivisions": 3, "bsdf": {"type": "cooktorrance"}}
-        self.scene = mi.load_dict({"type": "scene", "ball": ball, **({"wall": WALL} if wall else {}), **sensors})
+        world = {"type": "scene", "ball": ball, **({"wall": WALL} if wall else {}), **sensors}
+        self.scene = mi.load_dict(world, parallel=False)  # plugins in Python fail now and then in several threads
         shape = next(s for s in self.scene.shapes() if s.id() == "ball")
         self.surface = Surface(self.scene, shape)
         harmonics = np.random.default_rng(9).normal(0, 0.4, (BASIS, 3)) if room else None
