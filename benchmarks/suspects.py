@@ -49,11 +49,6 @@ class Lens(NamedTuple):
     random: np.random.Generator
 
 
-def same(values: np.ndarray, lens: Lens) -> np.ndarray:
-    """Change nothing."""
-    return values
-
-
 def narrow(values: np.ndarray, lens: Lens) -> np.ndarray:
     """Light like a narrow flash that points down, as that of two real captures does."""
     return values * (lens.forward**38 * np.exp(-6 * lens.up) * 1.3)[..., None]
@@ -86,7 +81,7 @@ class Suspect(NamedTuple):
     """A fault, and the values of `--refine` that should cure it."""
 
     cure: tuple[str, ...] = ("auto",)
-    radiance: Callable[[np.ndarray, Lens], np.ndarray] = same  #: of linear values (H, W, 3)
+    radiance: Callable[[np.ndarray, Lens], np.ndarray] = lambda values, lens: values  #: linear, (H, W, 3)
     encoded: Callable[[np.ndarray], np.ndarray] = lambda values: values
     mask: Callable[[np.ndarray], np.ndarray] = lambda mask: mask
     pose: Callable[[np.ndarray, np.random.Generator], np.ndarray] = lambda pose, random: pose

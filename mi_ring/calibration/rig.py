@@ -109,8 +109,8 @@ class Rig:
     @property
     def open_cone(self) -> bool:
         """True if the lights are one flash beside the lens, and the capture does not tell its cone."""
-        return self.flash is not None and float(self.upright[:2].norm()) < BESIDE * self.distance and not bool(
-            self.views.cone.any())  # fmt: skip
+        beside = float(self.upright[:2].norm()) < BESIDE * self.distance
+        return self.flash is not None and beside and not self.views.cone.any()
 
     @property
     def turned(self) -> bool:

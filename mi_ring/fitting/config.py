@@ -49,8 +49,9 @@ class Common:
     auto: one of these four. The background of the photographs and coarse fits tell which. This takes longer."""
     refine: tuple[Unknown, ...] = ("auto",)
     """Calibration that the fit corrects, in addition to surface and material. Initial values come from the scene file.
-    auto: light, power, ambient. Also falloff, for a flash that moves with the camera if the scene file gives no cone
-    and you do not refine vignetting; and scale, if with these lights the object would reflect more light than it gets.
+    auto: light, power, ambient. Also scale, if with these lights the object would reflect more light than it gets.
+    Also falloff, if the lights are a flash beside the lens. The scene file must give it no cone, and vignetting must
+    not be refined.
     With another --light than capture, auto is gain and ambient; for lamps also light and lamps.
     none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto cameras focal.
     cameras: position and direction of each camera.
