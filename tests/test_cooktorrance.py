@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.microfacets import CONTEXT, TWINS, direction, directions, draw, evaluate, interaction, twin, vectors
 
-from mi_ring.plugins.cooktorrance import cosine_factors
+from mi_ring.plugins.cooktorrance import DARKER, MEAN, cosine_factors, rough_lobe
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.system import machine
 
@@ -274,6 +274,66 @@ def test_sample_and_eval_pdf_agree_with_eval_and_pdf(material, distribution, mon
     np.testing.assert_array_equal(np.array(both[1]), np.array(pdf))
 
 
+# A rough diffuse part.
+
+
+def rough_cosine(i, o, sigma):
+    """The rough diffuse term with ρᵈ = 1, times n·i, by angles as Oren and Nayar write it: (N,)."""
+    theta_i, theta_o = np.arccos(i[:, 2]), np.arccos(o[:, 2])
+    azimuth = np.arctan2(i[:, 1], i[:, 0]) - np.arctan2(o[:, 1], o[:, 0])
+    across = np.cos(azimuth) * np.sin(theta_i) * np.sin(theta_o)
+    back = np.where(across > 0, across / np.cos(np.minimum(theta_i, theta_o)), across)
+    return np.cos(theta_i) * (1 + sigma * back) / (1 + (1 / 2 - 2 / (3 * np.pi)) * sigma)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.2, 1.0])
+def test_rough_matte_surfaces_are_those_of_oren_and_nayar(sigma):
+    i, o = directions(300, 21), directions(300, 22)
+    bsdf = cooktorrance([0.3, 0.1, 0.02], 0, 0.4, diffuse_roughness=sigma)
+    expected = rough_cosine(i, o, sigma)[:, None] * [0.3, 0.1, 0.02]
+    np.testing.assert_allclose(evaluate(bsdf, i, o), expected, rtol=2e-5)
+    np.testing.assert_allclose(evaluate(bsdf, o, i) * i[:, 2:], expected * o[:, 2:], rtol=3e-5)  # reciprocal
+
+
+def test_a_rough_matte_surface_is_flatter_toward_the_light():
+    """Lit from the viewer it has 1 + σ sin²/cos of Lambert's brightness, up to a factor that is the same everywhere."""
+    o = np.stack([direction(angle, 20) for angle in (0, 60, 80)])
+    bsdf, lambert = (cooktorrance([0.1] * 3, 0, 0.4, diffuse_roughness=sigma) for sigma in (0.25, 0))
+    ratio = (evaluate(bsdf, o, o) / evaluate(lambert, o, o))[:, 0]
+    np.testing.assert_allclose(ratio / ratio[0], 1 + 0.25 * (1 - o[:, 2] ** 2) / o[:, 2], rtol=1e-5)
+
+
+@every_viewer
+def test_albedo_of_a_rough_matte_surface(viewer):
+    """By sampling; of a surface that is white to a grazing viewer."""
+    bsdf = cooktorrance([1 / np.pi] * 3, 0, 0.4, diffuse_roughness=0.7)
+    weight = np.array(draw(bsdf, viewer, 200_000)[1])[0]
+    assert weight.mean() == pytest.approx(float(rough_lobe(mi.Float(viewer[2]), 0.7)[0][0]), abs=2e-3)
+
+
+def test_albedo_of_a_rough_matte_surface_at_its_limits():
+    """Closed form: 1 / (1 + σ (1/2 − 2/(3π))) toward the normal, 1 from aside; in the mean as a GLB has it."""
+    sigma = 0.8
+    seen, aside = (float(rough_lobe(mi.Float(cosine), sigma)[0][0]) for cosine in (1.0, 1e-3))
+    assert seen == pytest.approx(1 / (1 + sigma * (1 / 2 - 2 / (3 * np.pi))), rel=1e-5)
+    assert aside == pytest.approx(1, abs=2e-3)
+    i, o = directions(400_000, 23, 1e-3), directions(400_000, 24, 1e-3)
+    mean = 4 * (rough_cosine(i, o, sigma) * o[:, 2]).mean()  # ∫∫ (n·i)(n·o) di do = π²
+    assert mean == pytest.approx((1 + MEAN * sigma) / (1 + DARKER * sigma), rel=5e-3)
+
+
+def test_gradient_of_the_diffuse_roughness():
+    i, o = directions(300, 25), directions(300, 26)
+    bsdf = cooktorrance([0.3, 0.1, 0.02], 0.05, 0.4, diffuse_roughness=0.3)
+    params = mi.traverse(bsdf)
+    leaf = params["diffuse_roughness.value"]
+    dr.enable_grad(leaf)
+    params.update()
+    dr.backward(dr.sum(dr.sum(bsdf.eval(CONTEXT, interaction(o), vectors(i)))))
+    high, low = (0.42 * rough_cosine(i, o, sigma).sum() for sigma in (0.301, 0.299))
+    assert float(dr.grad(leaf)[0]) == pytest.approx((high - low) / 0.002, rel=1e-3)
+
+
 # Gradients.
 
 
@@ -450,12 +510,12 @@ def test_attributes_of_a_stock_mesh_are_accepted(tetrahedron):
 
 @pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
 @pytest.mark.parametrize("roughness", [0.05, 0.3, 0.8])
-@pytest.mark.parametrize("cosine", [0.97, 0.4])
-def test_lobes_reflect_harmonics_as_samples_do(distribution, roughness, cosine):
+@pytest.mark.parametrize(("cosine", "rough"), [(0.97, 0.0), (0.4, 0.0), (0.4, 0.3)])
+def test_lobes_reflect_harmonics_as_samples_do(distribution, roughness, cosine, rough):
     """Of each degree the nearest that a round lobe comes: exactly for l = 0 and 1, if its direction is the mean one."""
     diffuse = {"type": "rgb", "value": [0.1, 0.05, 0.2]}
     bsdf = mi.load_dict({"type": "cooktorrance", "diffuse": diffuse, "specular": 0.06, "roughness": roughness,
-                         "distribution": distribution})  # fmt: skip
+                         "distribution": distribution, "diffuse_roughness": rough})  # fmt: skip
     count, sine = 2**18, float(np.sqrt(1 - cosine**2))
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))

@@ -8,17 +8,20 @@ import numpy as np
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import bsdf_element
 from mi_ring.errors import InputError
-from mi_ring.nets.brdf_net import COOK_TORRANCE, Parameter
+from mi_ring.nets.brdf_net import COOK_TORRANCE, ROUGH, Parameter
 from mi_ring.scene.mesh_attributes import attributes_of, constant_values
 from mi_ring.scene.xml_elements import load_bsdf
 
 
-def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]]) -> tuple[tuple[Parameter, ...], str]:
+def predicted_parameters(
+    capture: Capture, ranges: dict[str, tuple[float, float]], rough: bool = False
+) -> tuple[tuple[Parameter, ...], str]:
     """Choose the BSDF parameters that BRDF-Net predicts. Returns (parameters, XML of the BSDF that reads them).
 
     `ranges`: a dict from parameter names, as in the BSDF's documentation, to (lowest, highest) value; the highest may
-    be infinite. If the dict is empty, all parameters of `cooktorrance` that are not constant are chosen. Raises
-    InputError if the scene's BSDF lacks a parameter. The message lists those that exist.
+    be infinite. If the dict is empty, all parameters of `cooktorrance` that are not constant are chosen. `rough`: among
+    these is `diffuse_roughness`, which the paper's reflectance lacks. Raises InputError if the scene's BSDF lacks a
+    parameter. The message lists those that exist.
     """
     scene, bsdf = capture.path, capture.shape.bsdf()
     element = bsdf_element(ElementTree.fromstring(capture.xml), scene)[1]
@@ -29,7 +32,11 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
                              "without files and references; use constants")  # fmt: skip
         inner.attrib.pop("id", None)  # the scene may contain it, too, if the shape refers to it
     textures = constant_values(bsdf)
-    own = {p.name: p for p in COOK_TORRANCE if kind == "cooktorrance" and p.name not in textures}
+    if rough and not ranges and kind == "cooktorrance" and element.find(f"*[@name='{ROUGH.name}']") is None:
+        read_attribute(ElementTree.SubElement(element, "texture"), ROUGH.name)
+        del textures[ROUGH.name]
+    known = (*COOK_TORRANCE, ROUGH) if kind == "cooktorrance" else ()
+    own = {p.name: p for p in known if p.name not in textures}
     names = ", ".join([*textures, *own])
     if not ranges and kind != "cooktorrance":
         raise InputError(f"{scene}: bsdf: --parameters must say which parameters of {kind} to predict, and their "
@@ -54,9 +61,7 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
             raise InputError(f"{scene}: bsdf: {name}: is {value.mean():g}, must be within the range of --parameters, "
                              f"{low:g} to {high:g}")  # fmt: skip
         parameters.append(Parameter(name, 3 if value.size == 3 else 1, low, high, initial_output(value, low, high)))
-        texture.clear()
-        texture.tag, texture.attrib = "texture", {"name": name, "type": "mesh_attribute"}
-        ElementTree.SubElement(texture, "string", name="name", value=f"vertex_{name}")
+        read_attribute(texture, name)
     xml = ElementTree.tostring(element, "unicode")
     try:
         left = attributes_of(load_bsdf(xml)) - {f"vertex_{p.name}" for p in parameters}
@@ -69,6 +74,13 @@ def predicted_parameters(capture: Capture, ranges: dict[str, tuple[float, float]
         raise InputError(f"{scene}: bsdf: every parameter of {kind} is a constant; --parameters must say which of "
                          f"{names} to predict")  # fmt: skip
     return tuple(parameters), xml
+
+
+def read_attribute(element: ElementTree.Element, name: str) -> None:
+    """Change an element of a BSDF, in place: the parameter `name` becomes a texture that reads a mesh attribute."""
+    element.clear()
+    element.tag, element.attrib = "texture", {"name": name, "type": "mesh_attribute"}
+    ElementTree.SubElement(element, "string", name="name", value=f"vertex_{name}")
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:

@@ -176,6 +176,9 @@ class Ablation:
     """How the difference of predicted and observed colours is measured.
     l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.
     log: difference of logarithms, for dark surfaces. l1+log: the mean of l1 and log."""
+    diffuse: Literal["rough", "lambert"] = "rough"
+    """How matte surfaces reflect light. lambert: equally in all directions, as in the paper.
+    rough: more toward the light, as wood, cloth and stone do. The fit finds how much, everywhere on the surface."""
     optimizer: Literal["muon", "adam"] = "muon"
     """The optimisers that train the networks. Set adam to train them as in the paper.
     muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all weights, as in the paper."""
@@ -342,6 +345,6 @@ PRESETS: dict[str, dict] = {
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
         "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
         "precision": "float32", "domain": "sphere", "masks": "given", "shadows": False, "indirect": False,
-        "refine": ("none",), "detail": "none",
+        "refine": ("none",), "detail": "none", "diffuse": "lambert",
     },
 }  # fmt: skip

@@ -33,6 +33,8 @@ COOK_TORRANCE = (
     Parameter("specular", 1, 0.0, math.inf, -2.0),
     Parameter("roughness", 1, 0.0, 1.0, -0.5),
 )
+#: A sixth number: how much brighter the rims of a rough matte surface are than the paper's.
+ROUGH = Parameter("diffuse_roughness", 1, 0.0, 1.0, -3.0)
 
 
 def albedo_of(parameters: Sequence[Parameter]) -> Parameter | None:

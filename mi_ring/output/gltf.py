@@ -15,7 +15,7 @@ from mi_ring.errors import InputError
 from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
-from mi_ring.plugins.cooktorrance import MIN_ROUGHNESS
+from mi_ring.plugins.cooktorrance import DARKER, MEAN, MIN_ROUGHNESS
 from mi_ring.scene.mesh_attributes import constant_values
 from mi_ring.scene.visibility import MaskedCamera, visible_points
 from mi_ring.scene.xml_elements import load_bsdf
@@ -46,7 +46,8 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
     give ρᵈ + 4 ρᵞ D V with the same D (GGX). V = G / (4 (n·i)(n·o)) differs: G is Smith's product in ``cooktorrance``
     and height-correlated in glTF. If the surface conserves energy, π ρᵈ + 4 ρᵞ ≤ 1, then c ≤ 1 and w ≤ 1. If more than
-    1 % of the points do not conserve energy, the intensities of the lights were wrong. Then all ρ are scaled.
+    1 % of the points do not conserve energy, the intensities of the lights were wrong. Then all ρ are scaled. glTF has
+    no rough matte surfaces: instead of ρᵈ with a `diffuse_roughness`, c has Lambert's ρᵈ of the same mean albedo.
 
     ``diffuse`` is exact in glTF. ``principled`` without other lobes is nearly exact. Raises InputError for other BSDFs.
     """
@@ -65,7 +66,8 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
     zero = np.zeros(count, np.float32)
     if kind == "cooktorrance":
-        diffuse, specular = math.pi * value("diffuse", 3), 4 * value("specular")
+        rough, specular = value("diffuse_roughness"), 4 * value("specular")
+        diffuse = math.pi * value("diffuse", 3) * ((1 + MEAN * rough) / (1 + DARKER * rough))[:, None]
         scale = 1 / max(1.0, float(np.quantile(diffuse.max(1) + specular, 0.99)))
         w = np.clip(scale * specular, 0, 1)
         c = np.clip(scale * diffuse / np.maximum(1 - w, 1e-3)[:, None], 0, 1)

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -15,24 +15,37 @@ GLOSS_NODES, GLOSS_SAMPLES = (
     32,
     32,
 )  #: of `gloss_table`: nodes along each axis, and samples of each node along each axis
+#: of a rough diffuse surface: how its reflection in all directions and its mean albedo depend on the roughness
+DARKER, MEAN = 1 / 2 - 2 / (3 * math.pi), 2 / 3 - 28 / (15 * math.pi)
+
+
+class Parameters(NamedTuple):
+    """The parameters at surface interactions, each a Dr.Jit array."""
+
+    diffuse: Any
+    specular: Any
+    roughness: Any
+    diffuse_roughness: Any
 
 
 class CookTorrance(mi.BSDF):
     """The paper's reflectance, equation 1: B = ρᵈ + ρᵞ · D(n, h; r) · G(i, o; r) / (π (n·i)(n·o)).
 
-    ================ ================= ================================================================= =====
-    Parameter        Type              Description                                                       Flags
-    ================ ================= ================================================================= =====
-    ``diffuse``      rgb or texture    ρᵈ; the diffuse term has no 1/π. Default: the mesh attribute      P, ∂
-                                       ``vertex_diffuse``
-    ``specular``     float or texture  ρᵞ; it contains the Fresnel factor, which is constant. Default:   P, ∂
-                                       the mesh attribute ``vertex_specular``
-    ``roughness``    float or texture  r, the width α of the distribution, at least 0.02. Default: the   P, ∂
-                                       mesh attribute ``vertex_roughness``
-    ``distribution`` string            D and its G: ``ggx`` or ``beckmann``. Default: ``ggx``
-    ``fresnel``      boolean           true: it reflects more at grazing angles. Default: false, as in
-                                       the paper
-    ================ ================= ================================================================= =====
+    ===================== ================= ================================================================= =====
+    Parameter             Type              Description                                                       Flags
+    ===================== ================= ================================================================= =====
+    ``diffuse``           rgb or texture    ρᵈ; the diffuse term has no 1/π. Default: the mesh attribute      P, ∂
+                                            ``vertex_diffuse``
+    ``specular``          float or texture  ρᵞ; it contains the Fresnel factor, which is constant. Default:   P, ∂
+                                            the mesh attribute ``vertex_specular``
+    ``roughness``         float or texture  r, the width α of the distribution, at least 0.02. Default: the   P, ∂
+                                            mesh attribute ``vertex_roughness``
+    ``diffuse_roughness`` float or texture  σ of the diffuse term, 0 to 1. Default: 0, Lambert's constant, as P, ∂
+                                            in the paper
+    ``distribution``      string            D and its G: ``ggx`` or ``beckmann``. Default: ``ggx``
+    ``fresnel``           boolean           true: it reflects more at grazing angles. Default: false, as in
+                                            the paper
+    ===================== ================= ================================================================= =====
 
     The paper does not name D and G. Here they are those of Walter et al. 2007 (Microfacet Models for Refraction through
     Rough Surfaces). D is equation 33 (GGX) or 25 (Beckmann) without its 1/π. G is Smith's product of equation 34 or 27;
@@ -42,6 +55,12 @@ class CookTorrance(mi.BSDF):
     With ``fresnel``, ρᵞ grows with the angle between o and h up to 1/4, the value of a mirror, by "An Inexpensive BRDF
     Model for Physically-based Rendering" (Schlick 1994): F = F₀ + (1 − F₀) (1 − o·h)⁵ with F₀ = 4 ρᵞ. This needs the
     true ρᵞ. It makes no difference for a light next to the camera, but it matters for light from a table.
+
+    Wood, cloth, stone and other rough surfaces are brighter at their rims than Lambert's law says. With
+    ``diffuse_roughness``, ρᵈ is multiplied by (1 + σ s/t) / (1 + (1/2 − 2/(3π)) σ). Here s is i·o − (n·i)(n·o), and t
+    is max(n·i, n·o) if s > 0, else 1. This is Fujii's form of the model of Oren and Nayar, as in "EON: A Practical
+    Energy-Preserving Rough Diffuse BRDF" (Portsmouth, Kutz and Hill 2024), without its second term for light between
+    microfacets. It reflects at most as much as Lambert's.
 
     **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh::
 
@@ -76,7 +95,8 @@ class CookTorrance(mi.BSDF):
             }
     """
 
-    channels: ClassVar = {"diffuse": 3, "specular": 1, "roughness": 1}  #: number of channels of each parameter
+    #: number of channels of each parameter
+    channels: ClassVar = {"diffuse": 3, "specular": 1, "roughness": 1, "diffuse_roughness": 1}
 
     def __init__(self, props):
         super().__init__(props)
@@ -88,6 +108,8 @@ class CookTorrance(mi.BSDF):
         if not isinstance(self.fresnel, bool):
             raise ValueError(f'cooktorrance "{props.id()}": fresnel is {self.fresnel}, must be true or false')
         self.textures = {}
+        if "diffuse_roughness" not in props:
+            props["diffuse_roughness"] = 0.0
         for name in self.channels:
             if name not in props:
                 props[name] = mi.load_dict({"type": "mesh_attribute", "name": f"vertex_{name}"})
@@ -97,10 +119,10 @@ class CookTorrance(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def parameters(self, si, active=True):
-        """Evaluate the parameters at the surface interactions `si`. Returns (ρᵈ, ρᵞ, r), with r at least 0.02."""
-        diffuse = self.textures["diffuse"].eval(si, active)
-        specular = self.textures["specular"].eval_1(si, active)
-        return diffuse, specular, dr.maximum(self.textures["roughness"].eval_1(si, active), MIN_ROUGHNESS)
+        """Evaluate the parameters at the surface interactions `si`. The roughness r is at least 0.02."""
+        diffuse, *others = self.textures.values()
+        specular, r, sigma = (texture.eval_1(si, active) for texture in others)
+        return Parameters(diffuse.eval(si, active), specular, dr.maximum(r, MIN_ROUGHNESS), sigma)
 
     @staticmethod
     def front(si, wo):
@@ -125,20 +147,23 @@ class CookTorrance(mi.BSDF):
             return specular
         return specular + dr.maximum(0.25 - specular, 0) * dr.power(1 - dr.clip(cosine, 0, 1), 5)
 
-    def reflected(self, ctx, si, wo, diffuse, specular, r, active):
+    def reflected(self, ctx, si, wo, here, active):
         """Evaluate B (n·i) [1/sr], equation 1 times the cosine, for light from direction `wo` (local frame of `si`).
 
-        `diffuse`, `specular`, `r`: the parameters ρᵈ, ρᵞ and r at `si`. `ctx`: Mitsuba's BSDFContext; it can switch off
-        the diffuse or the specular part. The result is 0 where `active` is False, and for light or viewer behind the
-        surface.
+        `here`: the parameters at `si`. `ctx`: Mitsuba's BSDFContext; it can switch off the diffuse or the specular
+        part. The result is 0 where `active` is False, and for light or viewer behind the surface.
         """
         o, i = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (si.wi, wo))
         h = dr.normalize(wo + si.wi)
         h.z = dr.abs(h.z)  # at the contour h may be below the surface, where Mitsuba's D is 0
-        facets, specular = self.microfacets(r), self.with_fresnel(specular, dr.dot(si.wi, h))
+        facets, specular = self.microfacets(here.roughness), self.with_fresnel(here.specular, dr.dot(si.wi, h))
         # G with m = n: G only uses the side of m, and `front` tests the side.
         gloss = specular * facets.eval(h) * facets.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
-        value = diffuse * ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
+        beside = dr.dot(i, o) - i.z * o.z
+        back = beside / dr.select(beside > 0, dr.maximum(i.z, o.z), 1)
+        sigma = here.diffuse_roughness
+        matte = here.diffuse * (1 + sigma * back) / (1 + DARKER * sigma)
+        value = matte * ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         value += gloss * ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         return dr.select(active & self.front(si, wo), value * i.z, 0)
 
@@ -148,10 +173,11 @@ class CookTorrance(mi.BSDF):
         The first lobe is diffuse, the second specular. A lobe is a pair (axis, factors). The axis is a unit vector in
         the world, about which the lobe is symmetric. Factor l of the `order` + 1 factors multiplies the light's
         harmonics of degree l, evaluated at the axis; the sum over l is the reflected radiance. The diffuse lobe is that
-        of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). The specular
-        lobe is an approximation, tabulated over roughness and viewing angle.
+        of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). With a
+        ``diffuse_roughness`` it is exact up to degree 1. The specular lobe is an approximation, tabulated over
+        roughness and viewing angle.
         """
-        diffuse, specular, r = self.parameters(si, active)
+        diffuse, specular, r, sigma = self.parameters(si, active)
         active &= self.front(si, mi.Vector3f(0, 0, 1))
         diffuse, specular = dr.select(active, diffuse, 0), dr.select(active, specular, 0)
         across = [(r - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS), dr.maximum(si.wi.z, MIN_COSINE)]
@@ -159,15 +185,19 @@ class CookTorrance(mi.BSDF):
         tilt, height, *factors = gloss_table(mi.variant(), self.distribution, order).eval(at)
         toward = dr.normalize(mi.Vector3f(-tilt * si.wi.x, -tilt * si.wi.y, height))
         specular = self.with_fresnel(specular, dr.dot(si.wi, dr.normalize(si.wi + toward)))
+        albedo, aside, along = rough_lobe(si.wi.z, sigma)
+        mean = mi.Vector3f(aside * si.wi.x, aside * si.wi.y, along)
+        matte = [diffuse * albedo * factor for factor in cosine_factors(order)]
+        matte[1] = diffuse * dr.pi * dr.norm(mean)
         return [
-            (si.sh_frame.n, [diffuse * factor for factor in cosine_factors(order)]),
+            (si.to_world(dr.normalize(mean)), matte),
             (si.to_world(toward), [specular * factor for factor in factors]),
         ]
 
-    def gloss_probability(self, ctx, si, diffuse, specular):
+    def gloss_probability(self, ctx, si, here):
         """Compute the probability with which `sample` chooses the specular lobe: 4 ρᵞ / (π ρᵈ + 4 ρᵞ).
 
-        π ρᵈ and 4 ρᵞ are upper bounds of the albedos of both lobes. `diffuse`, `specular`: ρᵈ and ρᵞ. `ctx`: Mitsuba's
+        π ρᵈ and 4 ρᵞ are upper bounds of the albedos of both lobes. `here`: the parameters at `si`. `ctx`: Mitsuba's
         BSDFContext; if it switches one lobe off, the result is 0 or 1. The result has no gradients.
         """
         has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
@@ -175,8 +205,8 @@ class CookTorrance(mi.BSDF):
         if not (has_diffuse and has_gloss):
             return mi.Float(1.0 if has_gloss else 0.0)
         d, s = (
-            dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(diffuse))),
-            dr.detach(4 * self.with_fresnel(specular, si.wi.z)),
+            dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(here.diffuse))),
+            dr.detach(4 * self.with_fresnel(here.specular, si.wi.z)),
         )
         return dr.select(d + s > 0, s / (d + s), 0.5)
 
@@ -193,32 +223,32 @@ class CookTorrance(mi.BSDF):
         return dr.select(active & (si.wi.z > 0) & (wo.z > 0), pdf, 0)
 
     def eval(self, ctx, si, wo, active=True):
-        return self.reflected(ctx, si, wo, *self.parameters(si, active), active)
+        return self.reflected(ctx, si, wo, self.parameters(si, active), active)
 
     def pdf(self, ctx, si, wo, active=True):
-        diffuse, specular, r = self.parameters(si, active)
-        return self.density(si, wo, r, self.gloss_probability(ctx, si, diffuse, specular), active)
+        here = self.parameters(si, active)
+        return self.density(si, wo, here.roughness, self.gloss_probability(ctx, si, here), active)
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        diffuse, specular, r = self.parameters(si, active)
-        value = self.reflected(ctx, si, wo, diffuse, specular, r, active)
-        return value, self.density(si, wo, r, self.gloss_probability(ctx, si, diffuse, specular), active)
+        here = self.parameters(si, active)
+        value = self.reflected(ctx, si, wo, here, active)
+        return value, self.density(si, wo, here.roughness, self.gloss_probability(ctx, si, here), active)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
-        diffuse, specular, r = self.parameters(si, active)
-        gloss = self.gloss_probability(ctx, si, diffuse, specular)
+        here = self.parameters(si, active)
+        gloss = self.gloss_probability(ctx, si, here)
         chosen = sample1 < gloss
-        normal, _ = self.microfacets(r).sample(si.wi, sample2)
+        normal, _ = self.microfacets(here.roughness).sample(si.wi, sample2)
         bs = dr.zeros(mi.BSDFSample3f)
         bs.wo = dr.select(chosen, mi.reflect(si.wi, normal), mi.warp.square_to_cosine_hemisphere(sample2))
-        bs.pdf = self.density(si, bs.wo, r, gloss, active)
+        bs.pdf = self.density(si, bs.wo, here.roughness, gloss, active)
         bs.eta = 1.0
         bs.sampled_component = dr.select(chosen, mi.UInt32(1), mi.UInt32(0))
         bs.sampled_type = dr.select(
             chosen, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
         )
         active &= bs.pdf > 0
-        value = self.reflected(ctx, si, bs.wo, diffuse, specular, r, active)
+        value = self.reflected(ctx, si, bs.wo, here, active)
         return bs, value / dr.select(active, bs.pdf, 1)
 
     def traverse(self, callback):
@@ -228,6 +258,22 @@ class CookTorrance(mi.BSDF):
     def to_string(self):
         inner = ", ".join(f"{name}={texture}" for name, texture in self.textures.items())
         return f"CookTorrance[distribution={self.distribution}, {inner}]"
+
+
+def rough_lobe(cosine, sigma):
+    """Compute the diffuse lobe of roughness `sigma` with π ρᵈ = 1, seen at this `cosine`, n·o. Returns three arrays.
+
+    They are the integrals over all i of the lobe L (its albedo, from "EON", Portsmouth, Kutz and Hill 2024), and of L
+    times two components of i: that along the surface on the viewer's side, divided by sin(n, o), and that along n.
+    """
+    mu = dr.maximum(cosine, MIN_COSINE)
+    sine, angle = dr.safe_sqrt(1 - mu**2), dr.safe_acos(mu)
+    albedo = sine * (angle - sine * mu) + 2 / 3 * (sine / mu * (1 - sine**3) - sine)
+    aside = dr.pi / 2 * (1 - mu - (1 - mu**3) / 3 + (1 - sine**4) / (4 * mu) + 1 / 4)
+    rest = dr.pi / 16 - angle / 8 + dr.sin(4 * angle) / 32
+    along = 2 * sine * (sine**3 / 3 + rest / mu - dr.pi / 16)
+    darker, back = 1 / (1 + DARKER * sigma), sigma / dr.pi
+    return darker * (1 + back * albedo), darker * back * aside, darker * (2 / 3 + back * along)
 
 
 def cosine_factors(order):
