@@ -12,6 +12,10 @@ from mi_ring import fit
 from mi_ring.capture import reflectance
 from mi_ring.capture.loading import load_capture
 from mi_ring.errors import InputError
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.fit import Fit
+from mi_ring.nets.brdf_net import COOK_TORRANCE, ROUGH, BRDFNet
+from mi_ring.nets.shape_net import ShapeNet
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.rendering import prediction
@@ -129,6 +133,30 @@ def test_part_of_cooktorrance(broken_capture):
     assert [p.name for p in reflectance.predicted_parameters(loaded, {})[0]] == ["diffuse", "roughness"]
     with pytest.raises(InputError, match="nothing writes vertex_roughness, which cooktorrance reads"):
         reflectance.predicted_parameters(loaded, {"diffuse": (0, 1)})
+
+
+def test_rough_matte_surfaces_unless_the_scene_says_how_rough(broken_capture):
+    path, edit = broken_capture
+    parameters, xml = reflectance.predicted_parameters(load_capture(path), {}, rough=True)
+    assert [p.name for p in parameters] == ["diffuse", "specular", "roughness", "diffuse_roughness"]
+    assert "vertex_diffuse_roughness" in str(xml_elements.load_bsdf(xml))
+    assert len(reflectance.predicted_parameters(load_capture(path), {})[0]) == 3
+    edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><float name="diffuse_roughness" value="0.2"/></bsdf>')
+    parameters, xml = reflectance.predicted_parameters(load_capture(path), {}, rough=True)
+    assert [p.name for p in parameters] == ["diffuse", "specular", "roughness"]
+    assert "0.2" in xml
+
+
+def test_given_networks_keep_their_parameters(broken_capture):
+    """A network of the paper's five numbers is not asked for a sixth, and one of six keeps it."""
+    capture, settings = load_capture(broken_capture[0]), Config(domain="sphere")
+    assert len(Fit(capture, settings).ring.brdf_net.bsdf_parameters) == 4
+    lambert = Fit(capture, Config(domain="sphere", diffuse="lambert"))
+    assert len(lambert.ring.brdf_net.bsdf_parameters) == 3
+    for parameters in (COOK_TORRANCE, (*COOK_TORRANCE, ROUGH)):
+        networks = (ShapeNet(), BRDFNet(1.0, parameters))
+        fit = Fit(capture, settings, networks)
+        assert [p.name for p in fit.ring.brdf_net.bsdf_parameters] == [p.name for p in parameters]
 
 
 WRONG = {
