@@ -13,7 +13,7 @@ from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Observation
 from mi_ring.fitting import losses
-from mi_ring.fitting.exposure_solver import ExposureSolver
+from mi_ring.fitting.exposure_solver import ExposureSolver, quarters, shared_part
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.pose_solver import curvature, motion, slopes
 from mi_ring.fitting.processes import ALONE
@@ -201,13 +201,35 @@ def test_powers_of_a_dark_colour_are_not_those_of_its_highlights(small_capture):
     seen = Observation(observed, torch.zeros(3, 8, 10, 3, dtype=torch.bool), inside, torch.ones(3).bool(), None)
     it = Iteration(batch, seen, SimpleNamespace(rgb=predicted, coverage=inside), fit.context())
     powers.look(it)
-    found = torch.stack([brighter for _, brighter in powers.seen])
+    found = powers.measured[[4, 7, 2], 0]
     expected = factors.log() - factors.log().mean(0)
-    expected[:, 1] = torch.tensor([-0.5, 0.5, torch.nan]) * np.log(1.1)
-    assert [k for k, _ in powers.seen] == [4, 7, 2]
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5, equal_nan=True)
+    expected[:, 1] = torch.tensor([-0.5, 0.5, 0]) * np.log(1.1)
+    assert powers.seen == [4, 7, 2]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
     before = fit.model.calibration.power.detach().clone()
     powers.step()
     after = fit.model.calibration.power.detach()
     changed = (after != before).nonzero().tolist()
     assert after.isfinite().all() and [2, 1] not in changed and {k for k, _ in changed} <= {4, 7, 2}
+
+
+def test_only_what_quarters_of_photographs_have_in_common_is_exposure():
+    """Their mean has the variance of the exposures and a quarter of that of the errors: by simulation."""
+    random = np.random.default_rng(3)
+    exposures, errors = 0.1 * random.normal(size=(4000, 1, 3)), random.normal(size=(4000, 4, 3))
+    errors *= [0.0, 0.1, 10.0]  # of each colour
+    parts = exposures + errors
+    measured = torch.from_numpy(np.concatenate([parts.mean(1, keepdims=True), parts], 1)).float()
+    measured[::7, 2, 0] = 0  # where a quarter is unknown
+    expected = [1, 0.01 / (0.01 + 0.01 / 4), 0]
+    np.testing.assert_allclose(shared_part(measured), expected, atol=0.03)
+    assert shared_part(measured[:5]).tolist() == [1, 1, 1]
+
+
+def test_quarters_are_those_of_the_object():
+    inside = torch.zeros(10, 12, dtype=torch.bool)
+    inside[2:6, 5:11] = True
+    found = torch.full((10, 12), -1)
+    found[inside] = quarters(inside)
+    assert found[2, 5] == 0 and found[2, 10] == 1 and found[5, 5] == 2 and found[5, 10] == 3
+    assert [(found == k).sum().item() for k in range(4)] == [6, 6, 6, 6]

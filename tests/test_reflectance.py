@@ -141,7 +141,8 @@ def test_rough_matte_surfaces_unless_the_scene_says_how_rough(broken_capture):
     assert [p.name for p in parameters] == ["diffuse", "specular", "roughness", "diffuse_roughness"]
     assert "vertex_diffuse_roughness" in str(xml_elements.load_bsdf(xml))
     assert len(reflectance.predicted_parameters(load_capture(path), {})[0]) == 3
-    edit('<bsdf type="cooktorrance"/>', '<bsdf type="cooktorrance"><float name="diffuse_roughness" value="0.2"/></bsdf>')
+    given = '<bsdf type="cooktorrance"><float name="diffuse_roughness" value="0.2"/></bsdf>'
+    edit('<bsdf type="cooktorrance"/>', given)
     parameters, xml = reflectance.predicted_parameters(load_capture(path), {}, rough=True)
     assert [p.name for p in parameters] == ["diffuse", "specular", "roughness"]
     assert "0.2" in xml
