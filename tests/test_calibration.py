@@ -26,7 +26,7 @@ from mi_ring.capture.scenefile import recalibrated_xml
 from mi_ring.fitting import validation
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.fitting.refinement import refined_of
+from mi_ring.fitting.refinement import has_open_curve, refined_of
 from mi_ring.fitting.schedule import Stage
 from mi_ring.geometry.rotations import rotations
 from mi_ring.images import linear_to_srgb
@@ -287,18 +287,44 @@ def test_the_power_that_is_refined_begins_with_a_usual_albedo(broken_capture):
 
 def test_what_is_refined_on_demand_goes_with_auto(small_capture, tmp_path):
     capture = mi_ring.load_capture(small_capture)
-    assert refined_of(capture, Config(refine=("auto", "contrast")), "capture", 0.5, True) == (
+    assert refined_of(capture, Config(refine=("auto", "contrast")), "capture", 0.5, {"falloff"}) == (
         "light", "power", "falloff", "contrast", "ambient")  # fmt: skip
-    assert refined_of(capture, Config(), "capture", 0.5, False) == ("light", "power", "ambient")
+    assert refined_of(capture, Config(), "capture", 0.5) == ("light", "power", "ambient")
     known = edited(small_capture, tmp_path / "known", lambda element: ElementTree.SubElement(
         element, "string", name="tilt", value="0 -1"))  # fmt: skip
     for scene, refined in ((small_capture, True), (known, False)):  # a cone that the scene file tells is known
         fit = Fit(mi_ring.load_capture(scene), Config(domain="sphere"))
         assert ("falloff" in fit.model.calibration.refined) == refined
-    assert "scale" in refined_of(capture, Config(), "capture", 1.5, True)
-    assert "scale" not in refined_of(capture, Config(), "capture", 0.5, True)
+        assert "contrast" in fit.model.calibration.refined  # of files in sRGB
+    assert "scale" in refined_of(capture, Config(), "capture", 1.5)
+    assert "scale" not in refined_of(capture, Config(), "capture", 0.5)
     with pytest.raises(InputError, match="none alone"):
         Config(refine=("none", "light"))
+
+
+def test_the_contrast_is_refined_by_default_if_nothing_tells_the_curve(small_capture, tmp_path):
+    def with_field(kind, name, value):
+        path = edited(small_capture, tmp_path / name / value, lambda element: ElementTree.SubElement(
+            element, kind, name=name, value=value))  # fmt: skip
+        return mi_ring.load_capture(path)
+
+    assert has_open_curve(mi_ring.load_capture(small_capture))
+    assert has_open_curve(with_field("string", "encoding", "srgb"))
+    for kind, name, value in (
+        ("string", "encoding", "linear"),
+        ("float", "gamma", "1.1"),
+        ("float", "contrast", "1.1"),
+    ):
+        assert not has_open_curve(with_field(kind, name, value))
+
+
+@pytest.mark.parametrize("option", ["falloff", "contrast"])
+def test_few_photographs_do_not_tell_cone_and_contrast(small_capture, option):
+    capture = mi_ring.load_capture(small_capture)
+    few = replace(capture, shots=capture.shots[:9])
+    with pytest.raises(mi_ring.InputError, match=f"--refine {option}: the fit has 9 photographs.*at least 10"):
+        Fit(few, Config(domain="sphere", refine=("auto", option)))
+    assert option not in Fit(few, Config(domain="sphere")).model.calibration.refined
 
 
 def test_what_is_known_of_lens_and_gain_dims_what_the_curve_records(small_capture, tmp_path):
@@ -536,10 +562,10 @@ def test_a_curve_with_an_s_is_that_of_the_scene_that_it_makes(small_capture, tmp
     np.testing.assert_allclose(straight[0], radiance, rtol=1e-4)
     many = torch.tensor([[0.0, 1e-8, 1e-3, 0.4, 0.99, 1.0, 1.7]], requires_grad=True)
     calibration.response().with_curve(many, torch.tensor([1.3])).sum().backward()
-    assert many.grad.isfinite().all() and (many.grad > 0).all() and calibration.contrast.grad.isfinite()
+    assert many.grad.isfinite().all() and (many.grad > 0).all()
 
 
-@pytest.mark.parametrize("name", ["curve", "contrast", "vignetting"])
+@pytest.mark.parametrize("name", ["curve", "vignetting"])
 def test_gradients_of_what_is_recorded_equal_finite_differences(small_capture, name):
     calibration = unknowns_of(mi_ring.load_capture(small_capture), (name,))
     random = np.random.default_rng(4)
@@ -584,7 +610,7 @@ def test_a_fit_finds_a_flash_that_is_not_where_it_is_said_to_be(small_capture, t
     wrong = np.array([-6.0, -16.0, 4.0])  # beyond a tenth of the distance
     scene = edited(small_capture, tmp_path / "wrong", lambda element: move_light(element, wrong))
     config = Config(iterations=80, levels=(2,), widths=(56,), shares=(1,), refine=("light",), velocity_decay=0.3,
-                    batch=4, subdivisions=3, indirect=False, detail="none")  # fmt: skip
+                    batch=4, subdivisions=3, indirect=False, detail="none", diffuse="lambert")  # fmt: skip
     running = Fit(mi_ring.load_capture(scene), config)
     for _ in running:
         pass
@@ -668,7 +694,7 @@ def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_c
     unknown = mi_ring.load_capture(small_capture)
     for of, refine, refined in (
         (capture, ("auto",), None), (capture, ("cameras",), ("cameras",)),
-        (unknown, ("auto",), ("light", "power", "falloff", "ambient")), (unknown, ("none",), None),
+        (unknown, ("auto",), ("light", "power", "falloff", "contrast", "ambient")), (unknown, ("none",), None),
     ):  # fmt: skip
         calibration = Fit(of, Config(refine=refine, domain="sphere")).model.calibration
         assert (calibration and calibration.refined) == refined

@@ -196,7 +196,7 @@ def test_a_fit_under_two_unknown_lamps(under_two_lamps, tmp_path):
     fit.save(tmp_path)
     again = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     assert len(lamps_of(again.scene)) == 1
-    refined = refined_of(again, mi_ring.Config(), "capture", 0.5, False)
+    refined = refined_of(again, mi_ring.Config(), "capture", 0.5)
     assert refined == ("light", "power", "ambient")  # the second is known now
 
 
@@ -206,7 +206,7 @@ def test_lamps_are_refined_where_there_are_some(small_capture):
         with pytest.raises(mi_ring.InputError, match="emitter: --refine lamps: the scene has none, point or direction"):
             mi_ring.Fit(capture, mi_ring.Config.preset("fast", light=light, refine=("lamps",)))
     one = mi_ring.Config.preset("fast", light="lamps", refine=("auto", "lamps"))
-    assert "lamps" not in refined_of(capture, one, "lamps", 0.5, False)
+    assert "lamps" not in refined_of(capture, one, "lamps", 0.5)
     lamp = Light("point", np.array([30.0, 40, 50]), np.ones(3))
     under = replace(capture, scene=with_lamps(capture.scene, [lamp]))
     calibration = Calibration(under, ["lamps", "scale"], Rig(under, np.zeros(3), 0.5, power=3.0, lamps=True))

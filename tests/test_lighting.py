@@ -177,7 +177,7 @@ def test_a_flash_that_pairs_tell_is_no_unknown_light(in_an_environment):
                   in_an_environment.read_text())  # fmt: skip
     pairs.write_text(text.replace('"0 0 0"', '"1 1 1"'))
     capture = mi_ring.load_capture(pairs)
-    assert refined_of(capture, mi_ring.Config(), "capture", 0.5, False) == ("light", "power")
+    assert refined_of(capture, mi_ring.Config(), "capture", 0.5) == ("light", "power")
     with pytest.raises(InputError, match="ambient: is subtracted"):
         mi_ring.choose_lighting(capture, mi_ring.Config.preset("fast", light="auto"))
 
@@ -189,10 +189,10 @@ def test_what_is_refined_is_what_the_capture_leaves_open(small_capture, in_an_en
         (flashed, ("auto", "power"), "lamps", ("light", "power", "ambient")),
         (dark, ("auto",), "capture", ("gain", "ambient")),
     ):
-        assert refined_of(capture, mi_ring.Config(refine=refine), light, 0.5, False) == refined
+        assert refined_of(capture, mi_ring.Config(refine=refine), light, 0.5) == refined
     exact = tuple(replace(shot, calibrated=True) for shot in dark.shots)
     said = with_lighting(replace(dark, shots=exact), Lighting("environment"))
-    assert said.known and refined_of(said, mi_ring.Config(), "environment", 0.5, False) == ("ambient",)
+    assert said.known and refined_of(said, mi_ring.Config(), "environment", 0.5) == ("ambient",)
 
 
 def test_a_dark_room_that_stays_as_it_is_does_not_matter(small_capture, tmp_path):
@@ -304,7 +304,8 @@ def test_what_settles_does_not_get_darker_for_it(small_capture):
     one = torch.ones(len(s))
     step, values = 0.25 * (s[:, 0] > 0).float(), {}
     for name, brightness in (("diffuse", 0.02), ("diffuse", 0.5), ("roughness", -3.0), ("roughness", 0.5)):
-        material = {"diffuse": brightness * one[:, None].expand(-1, 3), "specular": one, "roughness": 0.5 * one}
+        material = {"diffuse": brightness * one[:, None].expand(-1, 3), "specular": one, "roughness": 0.5 * one,
+                    "diffuse_roughness": 0.1 * one}  # fmt: skip
         varying = brightness * (1 + step) if name == "diffuse" else torch.sigmoid(brightness + step)
         material[name] = (varying[:, None].expand(-1, 3) if name == "diffuse" else varying).requires_grad_()
         it = SimpleNamespace(batch=SimpleNamespace(faces=faces), context=fit.context(),

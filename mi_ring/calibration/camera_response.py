@@ -107,3 +107,21 @@ def with_contrast(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
     gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
     lit = values.clamp(min=BLACK)  # below it the curve is a straight line
     return contrasted(lit**gammas, contrast.to(values)) ** (1 / gammas) * (values / lit)
+
+
+@torch.no_grad()
+def contrast_slope(
+    recorded: Tensor, response: CameraResponse, index: Sequence[int] | np.ndarray, cosines: Tensor
+) -> Tensor:
+    """Compute the derivative of the logarithm of recorded values by the logarithm of the contrast.
+
+    `recorded` (N, H, W, 3): values without the known response, as in `CameraResponse.recorded`. `index` (N,): indices
+    of the photographs. `cosines` (N, H, W, 1): cosine of the angle between the ray of a pixel and the optical axis.
+    Returns a tensor of the shape of `recorded`. It is 0 at full scale and above.
+    """
+    known, _ = response.factors(recorded, index, cosines if response.has_vignetting else None)
+    gammas = response.gammas[index].to(recorded).view(-1, 1, 1, 1)
+    x = (recorded * known).clamp(BLACK, 1 - BLACK) ** gammas
+    v = torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    of_encoded = torch.where(x <= 0.0031308, 1.0, 2.4 * v / (v + 0.055))  # d log x / d log v
+    return of_encoded * (1 - v) * torch.logit(v) / gammas

@@ -190,12 +190,16 @@ class CurveExponent(Unknown):
 
 
 class Contrast(Unknown):
-    """Logarithm of the steepness of the S-curve in the camera's tone curve. One number for all photographs."""
+    """Logarithm of the steepness of the S-curve in the camera's tone curve. One number for all photographs.
+
+    Gradients ignore it.
+    """
 
     changes = "recording"
+    solved = True
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        return replace(now, response=now.response._replace(contrast=value))
+        return replace(now, response=now.response._replace(contrast=value.detach()))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         before, after = found.means(lambda shot: shot.response.contrast)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.errors import InputError
 from mi_ring.fitting.agreeing_adam import AgreeingAdam
-from mi_ring.fitting.cone_solver import ConeSolver
+from mi_ring.fitting.brightness_solver import BrightnessSolver
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import unfold
 from mi_ring.fitting.exposure_solver import ExposureSolver
@@ -92,15 +92,17 @@ class Optimisation:
     def begin(self) -> None:
         """Make new optimisers and solvers for what the model learns now: the networks and calibration, or details."""
         model, config = self.model, self.problem.config
-        self.solvers: list[ExposureSolver | ConeSolver | PoseSolver] = []  #: use more of an iteration than gradients
+        self.solvers: list[
+            ExposureSolver | BrightnessSolver | PoseSolver
+        ] = []  #: use more of an iteration than gradients
         if model.detailed:
             self.steppers = detail_steppers(model.ring, config)
         else:
             self.steppers = network_steppers(model.ring, config, self.problem.device)
         if (calibration := model.calibration) and not model.detailed:
             self.solvers += [ExposureSolver(calibration, n) for n in ("power", "gain") if n in calibration.refined]
-            if "falloff" in calibration.refined:
-                self.solvers.append(ConeSolver(calibration))
+            if {"falloff", "contrast"} & {*calibration.refined}:
+                self.solvers.append(BrightnessSolver(calibration))
             if "cameras" in calibration.refined:
                 self.solvers.append(PoseSolver(calibration, model.starts_near, self.terms))
             self.steppers += calibration_steppers(calibration, config)

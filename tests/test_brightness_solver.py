@@ -1,4 +1,4 @@
-"""The cone of a flash, solved from brightness within photographs: known cones, no cone, and darker rims."""
+"""The cone of a flash and the contrast of a camera, solved from brightness within photographs."""
 
 from types import SimpleNamespace
 
@@ -7,11 +7,13 @@ import pytest
 import torch
 from helpers.quick_fits import posed
 
+from mi_ring.calibration.camera_response import contrast_slope, with_contrast
 from mi_ring.capture.observation import Observation
-from mi_ring.fitting.cone_solver import ConeSolver, least_squares
+from mi_ring.fitting.brightness_solver import BrightnessSolver, least_squares
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.processes import ALONE
 from mi_ring.fitting.schedule import Stage
+from mi_ring.images import contrasted
 
 INDEX = np.arange(12)
 
@@ -43,16 +45,19 @@ def discs(fit, apart):
 
 
 def solved(fit, picture, photographed, inside, rounds=40, noise=0.1):
-    """Exponent and tilts that are found. `picture`, `photographed` (12, H, W): without the cone that the fit has."""
+    """Exponent, tilts and logarithm of the contrast that are found.
+
+    `picture`, `photographed` (12, H, W): without the cone and the contrast that the fit has.
+    """
     calibration, random = fit.model.calibration, torch.Generator().manual_seed(1)
-    solver, directions = ConeSolver(calibration), rays(fit)
+    solver, directions = BrightnessSolver(calibration), rays(fit)
     batch = SimpleNamespace(progress=0.5, photographs=INDEX, all_photographs=INDEX, scale=1,
                             share=ALONE.share(len(INDEX)), stage=Stage(2, 28, 0, 9))  # fmt: skip
     inside = inside.float()
     for _ in range(rounds):
-        exponent, left, up = solver.numbers()
+        exponent, left, up, contrast = solver.numbers()
         x, y, cosine = directions.unbind(-1)
-        shown = picture * cosine**exponent * (left * x + up * y).exp()
+        shown = contrasted(picture * cosine**exponent * (left * x + up * y).exp(), contrast.exp())
         error = (noise * torch.randn(picture.shape, generator=random)).exp()
         clipped = torch.zeros(*picture.shape, 3, dtype=torch.bool)
         seen = Observation((photographed * error)[..., None].expand(-1, -1, -1, 3), clipped, inside,
@@ -75,7 +80,34 @@ def test_a_cone_is_found_whatever_each_photographs_exposure(fit, cone):
     exposures = torch.linspace(0.6, 1.8, 12)[:, None, None]
     photographed = exposures * texture(fit) * cosine**exponent * (left * x + up * y).exp()
     found = solved(fit, texture(fit), photographed, discs(fit, 0.4) < 1, noise=0.02)
-    np.testing.assert_allclose(found, cone, rtol=0.05, atol=0.2)
+    np.testing.assert_allclose(found, [*cone, 0], rtol=0.05, atol=0.2)
+
+
+@pytest.mark.parametrize("contrast", [1.25, 1.0, 0.9])
+def test_a_contrast_is_found_whatever_each_photographs_exposure(small_capture, contrast):
+    """With it the S-curve, not only another exponent: photographs of other brightness have another slope."""
+    fit, _ = posed(small_capture, refine=("contrast",))
+    exposures = torch.linspace(0.4, 1.6, 12)[:, None, None]
+    photographed = contrasted((exposures * texture(fit)).clamp(max=0.9), contrast)
+    shown = (exposures * texture(fit)).clamp(max=0.9)  # of known powers
+    found = solved(fit, shown, photographed, discs(fit, 0.4) < 1, noise=0.02)
+    np.testing.assert_allclose(np.exp(found), [1, 1, 1, contrast], rtol=0.01)
+
+
+def test_rims_that_are_darker_than_predicted_are_no_contrast(small_capture):
+    fit, _ = posed(small_capture, refine=("contrast",))
+    squared = discs(fit, 0.4)
+    found = solved(fit, texture(fit), texture(fit) * (-0.7 * squared).exp(), squared < 1, noise=0.03)
+    np.testing.assert_allclose(found, 0, atol=0.02)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1.3])
+def test_slope_by_the_contrast_is_the_difference_of_two_curves(fit, gamma):
+    values = torch.linspace(0.0005, 0.995, 60).view(1, 5, 4, 3)
+    response = fit.model.calibration.rig.response._replace(gammas=torch.full((12,), gamma))
+    low, high = (with_contrast(values, torch.tensor(c).exp(), response.gammas[:1]).log() for c in (-0.01, 0.01))
+    found = contrast_slope(values, response, np.array([0]), torch.ones(1, 5, 4, 1))
+    torch.testing.assert_close(found, (high - low) / 0.02, rtol=1e-3, atol=1e-3)
 
 
 def test_rims_that_are_darker_than_predicted_are_no_cone(fit):
