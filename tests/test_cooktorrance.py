@@ -508,6 +508,24 @@ def test_attributes_of_a_stock_mesh_are_accepted(tetrahedron):
     mi.render(scene, spp=1)
 
 
+def test_a_mesh_may_tell_how_rough_it_is(tetrahedron):
+    """By its attribute. Without it the surface is Lambert's, and who renders it need not know which."""
+    constant = {"diffuse": {"type": "rgb", "value": [0.2, 0.1, 0.1]}, "specular": 0.1, "roughness": 0.4}
+
+    def rendered(sigma=None, **more):
+        scene = scene_of({"type": "ply", "filename": tetrahedron, "bsdf": {"type": "cooktorrance", **constant, **more}})
+        (mesh,) = scene.shapes()
+        if sigma is not None:
+            mesh.add_attribute("vertex_diffuse_roughness", 1, [sigma] * mesh.vertex_count())
+        require_attributes(mesh)
+        return np.array(mi.render(scene, spp=4, seed=1))
+
+    for sigma in (0.0, 0.4):
+        np.testing.assert_allclose(rendered(sigma), rendered(diffuse_roughness=sigma), rtol=1e-5)
+    np.testing.assert_allclose(rendered(), rendered(0.0), rtol=1e-6)
+    assert not np.allclose(rendered(0.4), rendered(), rtol=1e-2)
+
+
 @pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
 @pytest.mark.parametrize("roughness", [0.05, 0.3, 0.8])
 @pytest.mark.parametrize(("cosine", "rough"), [(0.97, 0.0), (0.4, 0.0), (0.4, 0.3)])

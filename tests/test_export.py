@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from helpers.microfacets import directions, twin
+from helpers.microfacets import directions, evaluate, twin
 from PIL import Image
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
@@ -190,6 +190,20 @@ def test_reflectances_beyond_one_are_scaled_and_the_scale_is_told():
     np.testing.assert_allclose(material.specular, 0.8 / albedo, rtol=1e-5)
     np.testing.assert_allclose(material.base_color[0], [1, 0.6, 0.2], rtol=1e-4)
     np.testing.assert_allclose(material.roughness, 0.5)
+
+
+def test_a_rough_matte_surface_becomes_a_smooth_one_of_the_same_mean_albedo():
+    """∫∫ B (n·i)(n·o) di do, by directions of known density."""
+    sigma = np.array([0.0, 0.3, 1.0])
+    values = {"diffuse": np.full((3, 3), 0.2), "specular": np.zeros(3), "roughness": np.full(3, 0.5),
+              "diffuse_roughness": sigma}  # fmt: skip
+    material = gltf.metallic_roughness('<bsdf type="cooktorrance"/>', values)
+    i, o = directions(300_000, 5, 1e-3), directions(300_000, 6, 1e-3)
+    for k in range(3):
+        bsdf = mi.load_dict({"type": "cooktorrance", "diffuse": {"type": "rgb", "value": 0.2}, "specular": 0.0,
+                             "roughness": 0.5, "diffuse_roughness": float(sigma[k])})  # fmt: skip
+        albedo = 4 * np.pi * (evaluate(bsdf, i, o)[:, 0] * o[:, 2]).mean()
+        assert material.base_color[k, 0] == pytest.approx(albedo, rel=0.01)
 
 
 def test_constants_of_the_bsdf_count():

@@ -25,7 +25,8 @@ def test_attributes_of_nested_bsdfs_are_found():
 
 def test_attributes_of_our_own_bsdf():
     bsdf = mi.load_dict({"type": "cooktorrance", "specular": 0.1, "diffuse": attribute("vertex_rho")})
-    assert mesh_attributes.attributes_of(bsdf) == {"vertex_rho", "vertex_roughness"}
+    assert mesh_attributes.attributes_of(bsdf) == {"vertex_rho", "vertex_roughness", "vertex_diffuse_roughness"}
+    assert mesh_attributes.optional_of(bsdf) == {"vertex_diffuse_roughness"}
 
 
 def test_names_that_look_like_more_than_a_name():

@@ -9,7 +9,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import bsdf_element
 from mi_ring.errors import InputError
 from mi_ring.nets.brdf_net import COOK_TORRANCE, ROUGH, Parameter
-from mi_ring.scene.mesh_attributes import attributes_of, constant_values
+from mi_ring.scene.mesh_attributes import attributes_of, constant_values, optional_of
 from mi_ring.scene.xml_elements import load_bsdf
 
 
@@ -32,18 +32,15 @@ def predicted_parameters(
                              "without files and references; use constants")  # fmt: skip
         inner.attrib.pop("id", None)  # the scene may contain it, too, if the shape refers to it
     textures = constant_values(bsdf)
-    if rough and not ranges and kind == "cooktorrance" and element.find(f"*[@name='{ROUGH.name}']") is None:
-        read_attribute(ElementTree.SubElement(element, "texture"), ROUGH.name)
-        del textures[ROUGH.name]
-    known = (*COOK_TORRANCE, ROUGH) if kind == "cooktorrance" else ()
-    own = {p.name: p for p in known if p.name not in textures}
+    own = {p.name: p for p in (*COOK_TORRANCE, ROUGH) if kind == "cooktorrance" and p.name not in textures}
     names = ", ".join([*textures, *own])
     if not ranges and kind != "cooktorrance":
         raise InputError(f"{scene}: bsdf: --parameters must say which parameters of {kind} to predict, and their "
                          f"ranges, for instance --parameters {next(iter(textures), 'reflectance')} 0 1; "
                          f"it has {names}")  # fmt: skip
     parameters = []
-    for name, (low, high) in (ranges or {p.name: (p.low, p.high) for p in own.values()}).items():
+    default = {p.name: (p.low, p.high) for p in own.values() if rough or p != ROUGH}
+    for name, (low, high) in (ranges or default).items():
         if not -math.inf < low < high:
             raise InputError(f"--parameters: {name}: range is {low:g} to {high:g}, must be from lower to higher")
         if name in own:
@@ -61,10 +58,13 @@ def predicted_parameters(
             raise InputError(f"{scene}: bsdf: {name}: is {value.mean():g}, must be within the range of --parameters, "
                              f"{low:g} to {high:g}")  # fmt: skip
         parameters.append(Parameter(name, 3 if value.size == 3 else 1, low, high, initial_output(value, low, high)))
-        read_attribute(texture, name)
+        texture.clear()
+        texture.tag, texture.attrib = "texture", {"name": name, "type": "mesh_attribute"}
+        ElementTree.SubElement(texture, "string", name="name", value=f"vertex_{name}")
     xml = ElementTree.tostring(element, "unicode")
     try:
-        left = attributes_of(load_bsdf(xml)) - {f"vertex_{p.name}" for p in parameters}
+        loaded = load_bsdf(xml)
+        left = attributes_of(loaded) - optional_of(loaded) - {f"vertex_{p.name}" for p in parameters}
     except InputError as error:
         raise InputError(f"{scene}: {error}; see --parameters") from error
     if left:
@@ -74,13 +74,6 @@ def predicted_parameters(
         raise InputError(f"{scene}: bsdf: every parameter of {kind} is a constant; --parameters must say which of "
                          f"{names} to predict")  # fmt: skip
     return tuple(parameters), xml
-
-
-def read_attribute(element: ElementTree.Element, name: str) -> None:
-    """Change an element of a BSDF, in place: the parameter `name` becomes a texture that reads a mesh attribute."""
-    element.clear()
-    element.tag, element.attrib = "texture", {"name": name, "type": "mesh_attribute"}
-    ElementTree.SubElement(element, "string", name="name", value=f"vertex_{name}")
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:

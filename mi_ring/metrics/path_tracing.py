@@ -15,7 +15,7 @@ from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs, pixel_rays
 from mi_ring.scene.assembly import assembled, split_tables, top_level_emitters
 from mi_ring.scene.lights import is_room
-from mi_ring.scene.mesh_attributes import attributes_of, require_attributes
+from mi_ring.scene.mesh_attributes import attributes_of, optional_of, require_attributes
 
 BATCHES = 16  #: independent renderings of each photograph; their spread is the Monte Carlo noise
 LANES = 1 << 21  #: most rays in one launch
@@ -45,7 +45,8 @@ def open_lit_scene(path: Path) -> tuple[mi.Scene, list]:
     try:
         for shape in scene.shapes():
             require_attributes(shape)
-            if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and attributes_of(shape.bsdf()):
+            needed = attributes_of(shape.bsdf()) - optional_of(shape.bsdf())
+            if isinstance(shape, shapenet.ShapeNetMesh) and shape.ring is None and needed:
                 raise SceneError(f"{shape.id()}: has no weights, so there is no object yet; give the folder of its fit")
         Photographs.of(shots)
         return with_flash(split_tables(scene)[0]), photographs_in(scene)

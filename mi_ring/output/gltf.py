@@ -66,7 +66,8 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
     zero = np.zeros(count, np.float32)
     if kind == "cooktorrance":
-        rough, specular = value("diffuse_roughness"), 4 * value("specular")
+        rough = value("diffuse_roughness") if "diffuse_roughness" in {*values, *fixed} else zero
+        specular = 4 * value("specular")
         diffuse = math.pi * value("diffuse", 3) * ((1 + MEAN * rough) / (1 + DARKER * rough))[:, None]
         scale = 1 / max(1.0, float(np.quantile(diffuse.max(1) + specular, 0.99)))
         w = np.clip(scale * specular, 0, 1)

@@ -40,8 +40,9 @@ class CookTorrance(mi.BSDF):
                                             the mesh attribute ``vertex_specular``
     ``roughness``         float or texture  r, the width α of the distribution, at least 0.02. Default: the   P, ∂
                                             mesh attribute ``vertex_roughness``
-    ``diffuse_roughness`` float or texture  σ of the diffuse term, 0 to 1. Default: 0, Lambert's constant, as P, ∂
-                                            in the paper
+    ``diffuse_roughness`` float or texture  σ of the diffuse term, 0 to 1. Default: the mesh attribute        P, ∂
+                                            ``vertex_diffuse_roughness``; 0, as in the paper, if there is
+                                            none
     ``distribution``      string            D and its G: ``ggx`` or ``beckmann``. Default: ``ggx``
     ``fresnel``           boolean           true: it reflects more at grazing angles. Default: false, as in
                                             the paper
@@ -97,6 +98,8 @@ class CookTorrance(mi.BSDF):
 
     #: number of channels of each parameter
     channels: ClassVar = {"diffuse": 3, "specular": 1, "roughness": 1, "diffuse_roughness": 1}
+    #: mesh attributes that a mesh may lack: Mitsuba then reads 0
+    optional: ClassVar = {"vertex_diffuse_roughness"}
 
     def __init__(self, props):
         super().__init__(props)
@@ -108,8 +111,6 @@ class CookTorrance(mi.BSDF):
         if not isinstance(self.fresnel, bool):
             raise ValueError(f'cooktorrance "{props.id()}": fresnel is {self.fresnel}, must be true or false')
         self.textures = {}
-        if "diffuse_roughness" not in props:
-            props["diffuse_roughness"] = 0.0
         for name in self.channels:
             if name not in props:
                 props[name] = mi.load_dict({"type": "mesh_attribute", "name": f"vertex_{name}"})

@@ -52,9 +52,10 @@ class ShapeNetMesh(mi.Mesh):
     ==================== ===== ========================================================================== =======
 
     The mesh has smooth normals, and an attribute ``vertex_<parameter>`` for each parameter that the fit in ``weights``
-    predicts. For `cooktorrance` these are ``vertex_diffuse`` (3 channels), ``vertex_specular`` (1) and
-    ``vertex_roughness`` (1). Without ``weights`` the mesh has the same three, with the values 0.5, 0 and 0.5. An error
-    is raised if the nested BSDF reads an attribute that the mesh does not have, or one with another number of channels.
+    predicts. For `cooktorrance` these are ``vertex_diffuse`` (3 channels), ``vertex_specular``, ``vertex_roughness``
+    and, unless the fit had ``--diffuse lambert``, ``vertex_diffuse_roughness`` (1 each). Without ``weights`` the mesh
+    has the first three, with the values 0.5, 0 and 0.5. An error is raised if the nested BSDF needs an attribute that
+    the mesh does not have, or reads one with another number of channels.
 
     What it does not do: texture coordinates; colours in spectral variants, where Mitsuba reads attributes of three
     channels as coefficients of a spectrum.

@@ -55,18 +55,25 @@ def attributes_of(bsdf) -> set[str]:
     return found
 
 
+def optional_of(bsdf) -> set[str]:
+    """Return the names of the mesh attributes that a BSDF reads if a mesh has them, and takes for 0 otherwise."""
+    return getattr(bsdf, "optional", set())
+
+
 def require_attributes(shape) -> None:
     """Raise SceneError if a shape does not have a mesh attribute that its BSDF reads, or if the channel count is wrong.
 
     Mitsuba itself would render such a shape black, without an error.
     """
     bsdf = shape.bsdf()
-    for name in sorted(attributes_of(bsdf)):
+    lacking = {name for name in optional_of(bsdf) if not shape.is_mesh() or not shape.has_attribute(name)}
+    for name in sorted(attributes_of(bsdf) - lacking):
         if not shape.is_mesh() or not shape.has_attribute(name):
             raise SceneError(f'shape "{shape.id()}": its BSDF reads the mesh attribute "{name}", which the shape does '
                              "not have")  # fmt: skip
     for name, expected in getattr(bsdf, "channels", {}).items():  # of `cooktorrance`
-        if attribute := attribute_of(bsdf.textures[name]):
+        attribute = attribute_of(bsdf.textures[name])
+        if attribute and attribute not in lacking:
             count = shape.face_count() if attribute.startswith("face_") else shape.vertex_count()
             found = dr.width(mi.traverse(shape)[attribute]) // count
             if found != expected:
