@@ -1,19 +1,25 @@
 """Fits with other BSDFs than `cooktorrance`: which parameters are predicted, and what becomes of the scene."""
 
 import math
+import shutil
 
 import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 import trimesh
+from conftest import AXES, CENTER
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from mi_ring import fit
 from mi_ring.capture import reflectance
 from mi_ring.capture.loading import load_capture
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
+from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.nets.brdf_net import COOK_TORRANCE, ROUGH, BRDFNet
 from mi_ring.nets.shape_net import ShapeNet
 from mi_ring.objects.fitted_object import FittedObject
@@ -209,3 +215,37 @@ def test_bsdf_by_reference(broken_capture, tmp_path):
     assert fit.main(arguments(path, tmp_path / "run")) == 0
     (shape,) = mi.load_file(str(tmp_path / "run" / "scene.xml"), parallel=False).shapes()
     assert '"vertex_base_color"' in str(shape.bsdf())
+
+
+def roughened(scene, folder, sigma):
+    """A copy of the small capture whose ellipsoid is a rough matte surface, by rays and normals in closed form."""
+    shutil.copytree(scene.parent, folder)
+    turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+    for shot in load_capture(scene).shots:
+        width, height = shot.size
+        v, u = np.mgrid[:height, :width] + 0.5
+        rays = shot.camera.directions(np.stack([u.ravel(), v.ravel()], 1))
+        start, along = (shot.camera.position - CENTER) @ turn / AXES, rays @ turn / AXES
+        a, b, c = (along**2).sum(1), along @ start, start @ start - 1
+        away = (-b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a
+        on_sphere = start + away[:, None] * along
+        normals = on_sphere / AXES @ turn.T
+        toward = shot.light.vector - (CENTER + (on_sphere * AXES) @ turn.T)
+        n, i, o = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (normals, toward, -rays))
+        n_i, n_o = ((n * x).sum(1).clip(0.02) for x in (i, o))
+        beside = (i * o).sum(1) - n_i * n_o
+        factor = (1 + sigma * beside / np.where(beside > 0, np.maximum(n_i, n_o), 1)) / (1 + 0.288 * sigma)
+        path = folder / "images" / shot.file_name
+        radiance = srgb_to_linear(np.asarray(Image.open(path)) / 255) * factor.reshape(height, width, 1)
+        Image.fromarray(to_bytes(linear_to_srgb(radiance))).save(path)
+    return folder / scene.name
+
+
+@pytest.mark.parametrize(("sigma", "low", "high"), [(0.0, 0.0, 0.05), (0.4, 0.3, 0.5)], ids=["lambert", "rough"])
+def test_a_fit_finds_how_rough_a_matte_surface_is(small_capture, tmp_path, sigma, low, high):
+    capture = load_capture(roughened(small_capture, tmp_path / "rough", sigma))
+    settings = Config(iterations=80, levels=(3,), widths=(56,), shares=(1,), batch=4, detail="none", refine=("none",))
+    ring = Fit(capture, settings).run()
+    with torch.no_grad():
+        found = ring.brdf_net(ring.domain.sample(3)[0])["diffuse_roughness"]
+    assert low <= found.mean() <= high
