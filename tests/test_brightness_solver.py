@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers.quick_fits import posed
 
-from mi_ring.calibration.camera_response import contrast_slope, with_contrast
+from mi_ring.calibration.camera_response import contrast_slope
 from mi_ring.capture.observation import Observation
 from mi_ring.fitting.brightness_solver import BrightnessSolver, least_squares
 from mi_ring.fitting.iteration import Iteration
@@ -103,10 +103,14 @@ def test_rims_that_are_darker_than_predicted_are_no_contrast(small_capture):
 
 @pytest.mark.parametrize("gamma", [1.0, 1.3])
 def test_slope_by_the_contrast_is_the_difference_of_two_curves(fit, gamma):
-    values = torch.linspace(0.0005, 0.995, 60).view(1, 5, 4, 3)
-    response = fit.model.calibration.rig.response._replace(gammas=torch.full((12,), gamma))
-    low, high = (with_contrast(values, torch.tensor(c).exp(), response.gammas[:1]).log() for c in (-0.01, 0.01))
-    found = contrast_slope(values, response, np.array([0]), torch.ones(1, 5, 4, 1))
+    """Of values without the gain and the vignetting that the capture knows: the curve sees both."""
+    values, cosines = torch.linspace(0.0005, 0.9, 120).view(2, 5, 4, 3), torch.linspace(0.8, 1, 40).view(2, 5, 4, 1)
+    gains = torch.rand(12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
+    response = fit.model.calibration.rig.response._replace(
+        gammas=torch.full((12,), gamma), gains=gains, known_vignetting=torch.full((12,), 1.5))  # fmt: skip
+    low, high = (response._replace(contrast=torch.tensor(c)).recorded(values, [4, 7], cosines).log()
+                 for c in (-0.01, 0.01))  # fmt: skip
+    found = contrast_slope(values, response, np.array([4, 7]), cosines)
     torch.testing.assert_close(found, (high - low) / 0.02, rtol=1e-3, atol=1e-3)
 
 

@@ -29,6 +29,16 @@ def test_attributes_of_our_own_bsdf():
     assert mesh_attributes.optional_of(bsdf) == {"vertex_diffuse_roughness"}
 
 
+@pytest.mark.parametrize("kind", ["twosided", "blendbsdf"])
+def test_what_a_nested_bsdf_may_lack_is_not_required(kind):
+    inner = {"type": "cooktorrance", "diffuse": {"type": "rgb", "value": 0.2}, "specular": 0.1, "roughness": 0.3}
+    nested = {"type": kind, "first": inner} | (
+        {"second": {"type": "diffuse"}, "weight": 0.5} if "blend" in kind else {}
+    )
+    shape = mi.load_dict({"type": "rectangle", "bsdf": nested})
+    mesh_attributes.require_attributes(shape)
+
+
 def test_names_that_look_like_more_than_a_name():
     bsdf = mi.load_dict({"type": "diffuse", "reflectance": attribute("vertex_a = [name = 3]")})
     assert mesh_attributes.attributes_of(bsdf) == {"vertex_a = [name = 3]"}

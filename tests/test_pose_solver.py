@@ -226,6 +226,24 @@ def test_only_what_quarters_of_photographs_have_in_common_is_exposure():
     assert shared_part(measured[:5]).tolist() == [1, 1, 1]
 
 
+def test_exposures_that_quarters_do_not_share_are_given_up(small_capture):
+    """Also those that were found before there were enough photographs to see it."""
+    fit, _ = posed(small_capture, refine=("power",))
+    solver, tensor = ExposureSolver(fit.model.calibration, "power"), fit.model.calibration.power
+    random = torch.Generator().manual_seed(1)
+    solver.measured[:] = torch.randn(solver.measured.shape, generator=random)
+    signs = torch.tensor([1.0, 1, -1, -1, 0])[:, None]  # the quarters contradict each other
+    solver.measured[:] = solver.measured[:, :1] * signs[[4, 0, 1, 2, 3]] + 0.01
+    solver.measured[:, 0] = 0.1
+    solver.measured[1, 0, 2] = 0  # unknown
+    with torch.no_grad():
+        tensor.fill_(1.0)
+    solver.seen = [0, 1]
+    for _ in range(60):
+        solver.step()
+    assert tensor[0].abs().max() < 0.01 and tensor[1, 2] == 1 and tensor[2, 0] == 1
+
+
 def test_quarters_are_those_of_the_object():
     inside = torch.zeros(10, 12, dtype=torch.bool)
     inside[2:6, 5:11] = True

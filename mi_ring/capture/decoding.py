@@ -1,5 +1,6 @@
 """Reads the image files of a capture, and decodes their pixels to linear radiance."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ import numpy as np
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading
-from mi_ring.image_headers import image_size
+from mi_ring.image_headers import encoding_of, image_size
 from mi_ring.images import contrasted, linear_to_srgb, mask_values, read_image
 from mi_ring.scene.shot import Encoding, Shot
 
@@ -160,6 +161,24 @@ def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
     if isinstance(pixels, LinearImage):
         return True
     return encoding == "linear" or (encoding == "auto" and pixels.dtype != np.uint8)
+
+
+def has_open_curve(shots: Sequence[Shot]) -> bool:
+    """Return True if photographs are files in sRGB, and the scene file does not tell their camera's curve.
+
+    Raises InputError if a file cannot be read.
+    """
+    if any(shot.response.gamma != 1 or shot.response.contrast != 1 or shot.files.ambient for shot in shots):
+        return False
+    encodings = set()
+    for file, encoding in {(shot.files.filename, shot.encoding) for shot in shots}:
+        if file is None:
+            return False
+        if encoding == "auto":
+            with reading(file, "an image"):
+                encoding = encoding_of(file)
+        encodings.add(encoding)
+    return encodings == {"srgb"}
 
 
 def read_mask(shot: Shot, field: str, scene: Path) -> np.ndarray:

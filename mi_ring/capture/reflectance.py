@@ -1,4 +1,4 @@
-"""Chooses the parameters of a scene's BSDF that BRDF-Net predicts: the paper's five, or those of another BSDF."""
+"""Chooses the parameters of a scene's BSDF that BRDF-Net predicts: those of `cooktorrance`, or of another BSDF."""
 
 import math
 import xml.etree.ElementTree as ElementTree

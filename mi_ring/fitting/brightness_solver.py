@@ -36,12 +36,12 @@ class BrightnessSolver(torch.optim.Optimizer):
         names = [name for name in ("falloff", "tilt", "contrast") if name in calibration.unknowns]
         super().__init__([{"params": [calibration.get_parameter(name) for name in names]}], {"lr": self.rate.initial})
         self.first = self.param_groups[0]["params"][0]
-        #: of each photograph, when it was last seen: means of products of the six columns and the error
+        #: of each photograph, when it was last seen: the products of the six columns and the error
         self.state[self.first] = {"moments": torch.zeros(len(calibration.rig), 7, 7)}
 
     @property
     def moments(self) -> Tensor:
-        """(P, 7, 7): the columns are those of `columns`; then the error. 0: not seen yet."""
+        """(P, 7, 7): sums over colours of mean products of the `columns` and, last, the error. 0: not seen yet."""
         return self.state[self.first]["moments"]
 
     def numbers(self) -> Tensor:
@@ -142,7 +142,8 @@ def estimate(moments: Tensor, wanted: list[int], others: list[int], widths: Tens
     share = max(0.0, 1 - DOUBT * max(float(remaining), 0.0) / explained) if explained > 0 else 0.0
     prior = widths.double().square().diag()
     shrunk = prior @ torch.linalg.solve(damped(prior + covariance[:k, :k]), solution[:k])
-    return (share * shrunk).float()  # "Estimation with quadratic loss", James and Stein 1961
+    # In the form of "Estimation with quadratic loss" (James and Stein 1961); `DOUBT` is its strength.
+    return (share * shrunk).float()
 
 
 def damped(matrix: Tensor) -> Tensor:

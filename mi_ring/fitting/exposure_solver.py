@@ -67,12 +67,14 @@ class ExposureSolver(torch.optim.Optimizer):
                     if len(values) >= (ENOUGH if part == 0 else ENOUGH // 4):
                         brighter[n, part, colour] = values.median()
         brighter = it.batch.share.gathered(brighter)
-        several = (~brighter.isnan()).sum(0) >= 2  # in each colour
+        several = (~brighter.isnan()).sum(0) >= 2  # of each part, in each colour
+        # Of each part its own: errors of the parts would depend on each other otherwise.
         mean = torch.where(several, brighter.nanmean(0), torch.nan)
-        for k, one in zip(it.batch.all_photographs.tolist(), brighter - mean[0]):
+        for k, one in zip(it.batch.all_photographs.tolist(), brighter - mean):
             if not one[0].isnan().all():
                 self.seen.append(k)
-                self.measured[k] = (one + self.width * self.tensor[k]).nan_to_num(0.0)
+                exposure = one + self.width * self.tensor[k]
+                self.measured[k] = torch.where(exposure.isnan(), self.measured[k], exposure)
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
@@ -80,23 +82,23 @@ class ExposureSolver(torch.optim.Optimizer):
         (group,) = self.param_groups
         shared = shared_part(self.measured)
         for k in self.seen:
-            exposure = shared * self.measured[k, 0]
-            change = group["lr"] * (exposure / self.width - (1 + PULL) * self.tensor[k])
-            self.tensor[k] += torch.where(exposure != 0, change, 0.0)
+            exposure, known = shared * self.measured[k, 0] / self.width, self.measured[k, 0] != 0
+            change = group["lr"] * (exposure - (1 + PULL) * self.tensor[k])
+            self.tensor[k] += torch.where(known, change, 0.0)
 
 
 def quarters(inside: Tensor) -> Tensor:
     """Number the pixels where `inside` (H, W) is True by the quarter of the object in which they are, 0 to 3."""
     places = inside.nonzero()
     low, right = (places > places.double().mean(0)).T
-    return 2 * low + 1 * right
+    return 2 * low + right
 
 
 def shared_part(measured: Tensor) -> Tensor:
     """Compute how much of the variance of exposures their quarters have in common, for each colour (3,), 0 to 1.
 
     `measured` (P, 5, 3): exposures of photographs and of their quarters; 0: unknown. An exposure times this factor is
-    its best linear estimate. It is 1 as long as there are too few photographs.
+    its best linear estimate. The factor is 1 as long as there are too few photographs whose quarters are all known.
     """
     result = torch.ones(3)
     for colour, exposures in enumerate(measured.unbind(-1)):

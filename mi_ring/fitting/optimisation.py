@@ -92,9 +92,8 @@ class Optimisation:
     def begin(self) -> None:
         """Make new optimisers and solvers for what the model learns now: the networks and calibration, or details."""
         model, config = self.model, self.problem.config
-        self.solvers: list[
-            ExposureSolver | BrightnessSolver | PoseSolver
-        ] = []  #: use more of an iteration than gradients
+        #: use more of an iteration than gradients
+        self.solvers: list[ExposureSolver | BrightnessSolver | PoseSolver] = []
         if model.detailed:
             self.steppers = detail_steppers(model.ring, config)
         else:

@@ -9,10 +9,10 @@ import numpy as np
 from mi_ring.calibration.calibration import OPTIONS
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import ALBEDO, Capture
+from mi_ring.capture.decoding import has_open_curve
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.problem import Problem
-from mi_ring.image_headers import encoding_of
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.scene.lights import shared_emitters
 
@@ -45,14 +45,16 @@ class Refinement(NamedTuple):
         Raises InputError if `falloff` or `contrast` is asked for with fewer than 10 photographs.
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
-        albedo, capture = math.pi * reflectance, problem.capture
-        several = len(problem.fitted) >= FEWEST
-        if asked := TOLD_BY_MANY & {*problem.config.refine} if not several else None:
+        albedo, capture, config = math.pi * reflectance, problem.capture, problem.config
+        asked, several = TOLD_BY_MANY & {*config.refine}, len(problem.fitted) >= FEWEST
+        if asked and not several:
             raise InputError(f"{capture.path}: --refine {min(asked)}: the fit has {len(problem.fitted)} photographs, "
                              f"which do not tell it; leave it out, or give at least {FEWEST}")  # fmt: skip
-        told = {"falloff"} if several and Rig(capture, center, problem.exposure).open_cone else set()
-        told |= {"contrast"} if several and has_open_curve(capture) else set()
-        refined = refined_of(problem.seen, problem.config, problem.lighting.kind, albedo, told)
+        open_unknowns: set[str] = set()
+        if several and "auto" in config.refine and not capture.known:
+            open_unknowns |= {"falloff"} if Rig(capture, center, problem.exposure).open_cone else set()
+            open_unknowns |= {"contrast"} if has_open_curve(capture.shots) else set()
+        refined = refined_of(problem.seen, config, problem.lighting.kind, albedo, open_unknowns)
         return cls(reflectance, refined, albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0)
 
     @property
@@ -61,21 +63,13 @@ class Refinement(NamedTuple):
         return math.pi * self.reflectance
 
 
-def has_open_curve(capture: Capture) -> bool:
-    """Return True if photographs are files in sRGB, and the scene file does not tell their camera's curve."""
-    shots, file = capture.shots, capture.shots[0].files.filename
-    told = any(shot.response.gamma != 1 or shot.response.contrast != 1 or shot.files.ambient for shot in shots)
-    encoding = shots[0].encoding
-    return not told and file is not None and (encoding_of(file) if encoding == "auto" else encoding) == "srgb"
-
-
 def refined_of(
-    capture: Capture, config: Config, light: str, albedo: float, told: Collection[str] = ()
+    capture: Capture, config: Config, light: str, albedo: float, open_unknowns: Collection[str] = ()
 ) -> tuple[str, ...]:
     """List the values of `--refine` that a fit refines, in a fixed order. The capture decides what `auto` means.
 
     `light`: kind of the light, such as "capture" or "lamps". `albedo`: of the object, computed from the lights'
-    strengths. `told`: those of `falloff` and `contrast` that the photographs can tell and the scene file does not.
+    strengths. `open_unknowns`: those of `falloff` and `contrast` that photographs can tell and the scene file does not.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known
@@ -85,7 +79,7 @@ def refined_of(
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
         subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
-        names |= {*told} - ({"falloff"} if "vignetting" in names else set())
+        names |= {*open_unknowns} - ({"falloff"} if "vignetting" in names else set())
         names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")

@@ -223,8 +223,8 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     share = room_light(np.array([row.brightness for row in rows])[exposed], received[exposed])
     if share > AMBIENT:
         found.append(f"the object is hardly darker if the flash is farther away: as if {share:.0%} of the light came "
-                     "from the room, or the camera's curve were flatter; a fit finds the room's light itself; if the "
-                     "curve is unknown, fit with --refine auto curve contrast")  # fmt: skip
+                     "from the room, or the camera's curve were flatter; a fit finds the room's light and the camera's "
+                     "contrast itself")  # fmt: skip
     if (views := len({shot.camera.to_world.tobytes() for shot in capture.shots})) < 8:
         found.append(f"{views} views are too few: a closed surface needs about 30 from all sides")
     return found

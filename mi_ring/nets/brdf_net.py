@@ -33,7 +33,7 @@ COOK_TORRANCE = (
     Parameter("specular", 1, 0.0, math.inf, -2.0),
     Parameter("roughness", 1, 0.0, 1.0, -0.5),
 )
-#: A sixth number: how much brighter the rims of a rough matte surface are than the paper's.
+#: A sixth number: the roughness of the matte part. 0 is the paper's.
 ROUGH = Parameter("diffuse_roughness", 1, 0.0, 1.0, -3.0)
 
 

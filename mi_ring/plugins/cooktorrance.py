@@ -15,7 +15,8 @@ GLOSS_NODES, GLOSS_SAMPLES = (
     32,
     32,
 )  #: of `gloss_table`: nodes along each axis, and samples of each node along each axis
-#: of a rough diffuse surface: how its reflection in all directions and its mean albedo depend on the roughness
+ROUGHNESS = "vertex_diffuse_roughness"
+#: The rough diffuse term is divided by 1 + DARKER σ. Its mean albedo is (1 + MEAN σ) / (1 + DARKER σ) of Lambert's.
 DARKER, MEAN = 1 / 2 - 2 / (3 * math.pi), 2 / 3 - 28 / (15 * math.pi)
 
 
@@ -57,11 +58,12 @@ class CookTorrance(mi.BSDF):
     Model for Physically-based Rendering" (Schlick 1994): F = F₀ + (1 − F₀) (1 − o·h)⁵ with F₀ = 4 ρᵞ. This needs the
     true ρᵞ. It makes no difference for a light next to the camera, but it matters for light from a table.
 
-    Wood, cloth, stone and other rough surfaces are brighter at their rims than Lambert's law says. With
+    Wood, cloth, stone and other rough surfaces that are lit from the viewer are brighter at their rims than Lambert's
+    law says. With
     ``diffuse_roughness``, ρᵈ is multiplied by (1 + σ s/t) / (1 + (1/2 − 2/(3π)) σ). Here s is i·o − (n·i)(n·o), and t
     is max(n·i, n·o) if s > 0, else 1. This is Fujii's form of the model of Oren and Nayar, as in "EON: A Practical
     Energy-Preserving Rough Diffuse BRDF" (Portsmouth, Kutz and Hill 2024), without its second term for light between
-    microfacets. It reflects at most as much as Lambert's.
+    microfacets. Its albedo is at most Lambert's, for every viewer.
 
     **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh::
 
@@ -98,8 +100,7 @@ class CookTorrance(mi.BSDF):
 
     #: number of channels of each parameter
     channels: ClassVar = {"diffuse": 3, "specular": 1, "roughness": 1, "diffuse_roughness": 1}
-    #: mesh attributes that a mesh may lack: Mitsuba then reads 0
-    optional: ClassVar = {"vertex_diffuse_roughness"}
+    optional: ClassVar = {ROUGHNESS}  #: mesh attributes that a mesh may lack: they are then 0
 
     def __init__(self, props):
         super().__init__(props)
@@ -110,6 +111,7 @@ class CookTorrance(mi.BSDF):
         self.fresnel = props.get("fresnel", False)
         if not isinstance(self.fresnel, bool):
             raise ValueError(f'cooktorrance "{props.id()}": fresnel is {self.fresnel}, must be true or false')
+        self.reads_optional = "diffuse_roughness" not in props
         self.textures = {}
         for name in self.channels:
             if name not in props:
@@ -122,7 +124,10 @@ class CookTorrance(mi.BSDF):
     def parameters(self, si, active=True):
         """Evaluate the parameters at the surface interactions `si`. The roughness r is at least 0.02."""
         diffuse, *others = self.textures.values()
-        specular, r, sigma = (texture.eval_1(si, active) for texture in others)
+        if dr.is_array_v(mi.Float) or not self.reads_optional or si.shape.has_attribute(ROUGHNESS):
+            specular, r, sigma = (texture.eval_1(si, active) for texture in others)
+        else:  # scalar variants raise an error if the mesh has no such attribute
+            specular, r, sigma = *(texture.eval_1(si, active) for texture in others[:2]), 0.0
         return Parameters(diffuse.eval(si, active), specular, dr.maximum(r, MIN_ROUGHNESS), sigma)
 
     @staticmethod

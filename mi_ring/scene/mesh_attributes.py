@@ -56,8 +56,9 @@ def attributes_of(bsdf) -> set[str]:
 
 
 def optional_of(bsdf) -> set[str]:
-    """Return the names of the mesh attributes that a BSDF reads if a mesh has them, and takes for 0 otherwise."""
-    return getattr(bsdf, "optional", set())
+    """Return the names of the mesh attributes that a BSDF, or a nested one, takes for 0 if a mesh lacks them."""
+    nested = (optional_of(value) for _, value in Members(bsdf).found if isinstance(value, mi.BSDF))
+    return set().union(getattr(bsdf, "optional", ()), *nested)
 
 
 def require_attributes(shape) -> None:
