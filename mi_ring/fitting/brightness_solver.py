@@ -18,9 +18,9 @@ from mi_ring.fitting.schedule import Rate
 MOST = 0.5  #: errors of logarithms are cut to ± this, so that highlights and shadows do not decide
 AIMED = 0.1  #: prior of the tilt, relative to the exponent: how uncertain the flash's axis is [rad]
 LEAST_TILT = 0.1  #: and at least this
-#: An unknown must explain more than this share of the variance that remains: light from a table, or a wrong material,
-#: may explain as much.
-DOUBT = 0.05
+#: The cone, and the contrast, must explain more than this share of the variance that remains: light from a table, or a
+#: wrong material, may explain as much.
+DOUBT_OF_CONE, DOUBT_OF_CONTRAST = 0.05, 0.01
 RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
 CONE, CONTRAST, SHOWN, AWAY = [0, 1, 2], [3], [4], [5]  #: numbers of the columns of `columns`
 
@@ -95,7 +95,7 @@ class BrightnessSolver(torch.optim.Optimizer):
             given = float(rig.views.cone[:, 0].mean())
             aimed = 0.0 if rig.turned else max(AIMED * abs(given + float(now[0])), LEAST_TILT)
             widths = torch.tensor([calibration.widths["falloff"], aimed, aimed])
-            cone = estimate(known, CONE, CONTRAST + SHOWN + AWAY, widths)
+            cone = estimate(known, CONE, CONTRAST + SHOWN + AWAY, widths, DOUBT_OF_CONE)
             cone[0] = cone[0].clamp(min=-given)  # no flash is brighter at its sides
             change = rate * (cone - now[:3])
             calibration.get_parameter("falloff").add_(change[0] / calibration.widths["falloff"])
@@ -103,7 +103,7 @@ class BrightnessSolver(torch.optim.Optimizer):
         if "contrast" in calibration.unknowns:
             # Without the column of another exponent: it is almost the same.
             width = calibration.widths["contrast"]
-            contrast = estimate(known, CONTRAST, CONE + AWAY, torch.tensor([width]))
+            contrast = estimate(known, CONTRAST, CONE + AWAY, torch.tensor([width]), DOUBT_OF_CONTRAST)
             calibration.get_parameter("contrast").add_(rate * (contrast[0] - now[3]) / width)
 
 
@@ -124,11 +124,12 @@ def columns(directions: Tensor, held: Tensor, slopes: Tensor, shown: Tensor) -> 
     return result - result.mean(0)
 
 
-def estimate(moments: Tensor, wanted: list[int], others: list[int], widths: Tensor) -> Tensor:
+def estimate(moments: Tensor, wanted: list[int], others: list[int], widths: Tensor, doubt: float) -> Tensor:
     """Estimate the unknowns of some columns. Returns (k,) float32, nearer to 0 the less they explain.
 
     `moments` (P, n + 1, n + 1): of photographs, with the error last. `wanted`: numbers of the k columns. `others`:
-    numbers of columns that are also solved for. `widths` (k,): standard deviations of the prior.
+    numbers of columns that are also solved for. `widths` (k,): standard deviations of the prior. `doubt`: share of the
+    remaining variance that they must explain.
     """
     k, which = len(wanted), wanted + others
     own = moments[:, [*which, -1]][..., [*which, -1]]
@@ -139,10 +140,10 @@ def estimate(moments: Tensor, wanted: list[int], others: list[int], widths: Tens
     both = matrix[k:, :k]
     alone = matrix[:k, :k] - both.T @ torch.linalg.solve(matrix[k:, k:], both)
     explained = float(solution[:k] @ alone @ solution[:k])
-    share = max(0.0, 1 - DOUBT * max(float(remaining), 0.0) / explained) if explained > 0 else 0.0
+    share = max(0.0, 1 - doubt * max(float(remaining), 0.0) / explained) if explained > 0 else 0.0
     prior = widths.double().square().diag()
     shrunk = prior @ torch.linalg.solve(damped(prior + covariance[:k, :k]), solution[:k])
-    # In the form of "Estimation with quadratic loss" (James and Stein 1961); `DOUBT` is its strength.
+    # In the form of "Estimation with quadratic loss" (James and Stein 1961), of strength `doubt`.
     return (share * shrunk).float()
 
 
