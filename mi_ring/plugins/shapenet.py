@@ -49,7 +49,6 @@ class ShapeNetMesh(mi.Mesh):
     ``vertex_diffuse``   float 3 per vertex; this and the next two if the fit has a `cooktorrance`        P, ∂
     ``vertex_specular``  float 1 per vertex                                                               P, ∂
     ``vertex_roughness`` float 1 per vertex                                                               P, ∂
-    ``vertex_…``         the same for each further parameter that the fit predicts                        P, ∂
     ==================== ===== ========================================================================== =======
 
     The mesh has smooth normals, and an attribute ``vertex_<parameter>`` for each parameter that the fit in ``weights``
