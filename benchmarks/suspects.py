@@ -4,7 +4,8 @@
 
 CAPTURE is a folder with scene.xml and truth/mesh.ply, whose flash is at the lens. The photographs are changed after
 rendering; interreflection is not changed with them. Every other photograph is one capture of the object, the others are
-a second one. Each is fitted twice: with `--refine light power ambient`, and with options that should cure the fault.
+a second one. Each is fitted twice: with `--refine light power ambient --diffuse lambert`, and with options that should
+cure the fault.
 
 Prints a Markdown table with machine and date: mean error of the normals against the truth (of both captures), and mean
 and median angle between the normals of both surfaces at the nearest points. The same command continues after an
@@ -23,6 +24,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from mi_ring.capture.scenefile import move_names, numbers
+from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.images import contrasted, linear_to_srgb
+from mi_ring.plugins.cooktorrance import DARKER
+
+# isort: split
+import mitsuba as mi
 import numpy as np
 import torch
 import trimesh
@@ -32,11 +40,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mi_ring.capture.scenefile import move_names, numbers
-from mi_ring.colour_profiles import srgb_to_linear
-from mi_ring.images import linear_to_srgb
-
-BEFORE = "light", "power", "ambient"  #: what `--refine auto` is without the cone
+BEFORE = "--refine light power ambient --diffuse lambert"  #: without what real photographs asked for
 POINTS, NEAR = 40_000, 0.01  #: of each surface; pairs of points farther apart do not count [diagonal]
 
 
@@ -46,12 +50,26 @@ class Lens(NamedTuple):
     left: np.ndarray
     up: np.ndarray
     forward: np.ndarray
+    facing: np.ndarray  #: (H, W) cosine between the surface's normal and the ray; 1 beside the object
     random: np.random.Generator
 
 
 def narrow(values: np.ndarray, lens: Lens) -> np.ndarray:
     """Light like a narrow flash that points down, as that of two real captures does."""
     return values * (lens.forward**38 * np.exp(-6 * lens.up) * 1.3)[..., None]
+
+
+def rough(values: np.ndarray, lens: Lens) -> np.ndarray:
+    """Light of a rough matte surface, as of `cooktorrance` with a `diffuse_roughness` of 0.25."""
+    cosine = lens.facing.clip(0.2)  # pixels at outlines show more than one surface
+    return values * ((1 + 0.25 * (1 - cosine**2) / cosine) / (1 + 0.25 * DARKER))[..., None]
+
+
+def facing(mesh: mi.Scene, pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Cosines (H, W) between the normals of a mesh and rays (3, H, W) in a camera's axes; 1 where there is no mesh."""
+    along = np.tensordot(pose[:3, :3], rays, 1).reshape(3, -1).astype(np.float32)
+    si = mesh.ray_intersect(mi.Ray3f(mi.Point3f(*pose[:3, 3].tolist()), mi.Vector3f(*map(mi.Float, along))))
+    return np.where(np.array(si.is_valid()), np.abs(np.array(si.wi.z)), 1).reshape(rays.shape[1:])
 
 
 def compressed(values: np.ndarray) -> np.ndarray:
@@ -78,9 +96,9 @@ def moved(pose: np.ndarray, random: np.random.Generator) -> np.ndarray:
 
 
 class Suspect(NamedTuple):
-    """A fault, and the values of `--refine` that should cure it."""
+    """A fault, and the options of a fit that should cure it."""
 
-    cure: tuple[str, ...] = ("auto",)
+    cure: str = "--refine auto"
     radiance: Callable[[np.ndarray, Lens], np.ndarray] = lambda values, lens: values  #: linear, (H, W, 3)
     encoded: Callable[[np.ndarray], np.ndarray] = lambda values: values
     mask: Callable[[np.ndarray], np.ndarray] = lambda mask: mask
@@ -90,12 +108,14 @@ class Suspect(NamedTuple):
 SUSPECTS = {
     "none": Suspect(),
     "narrow flash": Suspect(radiance=narrow),
+    "rough material": Suspect(radiance=rough),
     "clipped": Suspect(radiance=lambda values, lens: 3 * values),
     "exposures ± 15 %": Suspect(radiance=lambda values, lens: values * np.exp(0.15 * lens.random.normal())),
-    "curve": Suspect(("auto", "curve"), encoded=lambda v: linear_to_srgb(srgb_to_linear(v) ** 1.2)),
+    "contrast": Suspect(encoded=lambda v: linear_to_srgb(contrasted(srgb_to_linear(v), 1.4))),
+    "exponent": Suspect("--refine auto curve", encoded=lambda v: linear_to_srgb(srgb_to_linear(v) ** 1.2)),
     "JPEG": Suspect(encoded=compressed),
-    "blocky masks": Suspect(("auto", "masks"), mask=blocky),
-    "poses": Suspect(("auto", "cameras"), pose=moved),
+    "blocky masks": Suspect("--refine auto masks", mask=blocky),
+    "poses": Suspect("--refine auto cameras", pose=moved),
 }
 
 
@@ -105,6 +125,7 @@ def write(capture: Path, folder: Path, suspect: Suspect) -> Path:
     if scene.exists():
         return scene
     root = ElementTree.parse(capture / "scene.xml").getroot()
+    mesh = mi.load_dict({"type": "scene", "object": {"type": "ply", "filename": str(capture / "truth/mesh.ply")}})
     for number, sensor in enumerate(root.findall("sensor")):
         random = np.random.default_rng(number)
         name, mask = (sensor.find(f"string[@name='{key}']") for key in ("filename", "mask"))
@@ -112,15 +133,17 @@ def write(capture: Path, folder: Path, suspect: Suspect) -> Path:
         values = np.asarray(Image.open(capture / name.get("value")).convert("RGB"), np.float64) / 255
         y, x = np.mgrid[: len(values), : values.shape[1]] + 0.5
         rays = np.stack([(cx - x) / fx, (cy - y) / fy, np.ones_like(x)])
-        lens = Lens(*(rays / np.linalg.norm(rays, axis=0)), random)
+        rays /= np.linalg.norm(rays, axis=0)
+        matrix = sensor.find("transform/matrix")
+        pose = np.array(matrix.get("value").split(), float).reshape(4, 4)
+        lens = Lens(*rays, facing(mesh, pose, rays), random)
         values = suspect.encoded(linear_to_srgb(suspect.radiance(srgb_to_linear(values), lens).clip(0, 1)))
         silhouette = suspect.mask(np.asarray(Image.open(capture / mask.get("value")).convert("L")))
         for element, picture in ((name, (255 * values.clip(0, 1) + 0.5).astype(np.uint8)), (mask, silhouette)):
             path = folder / element.get("value")
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(picture).save(path)
-        matrix = sensor.find("transform/matrix")
-        pose = suspect.pose(np.array(matrix.get("value").split(), float).reshape(4, 4), random)
+        pose = suspect.pose(pose, random)
         matrix.set("value", numbers(pose.ravel()))
         point = sensor.find("emitter/point")  # the flash is at the lens
         for axis, value in zip("xyz", pose[:3, 3]):
@@ -145,14 +168,14 @@ def angles(one: Path, other: Path) -> np.ndarray:
     return np.degrees(np.arccos((of_b * of_a[nearest]).sum(1).clip(-1, 1)))[near]
 
 
-def measured(scene: Path, truth: Path, refine: tuple[str, ...], options: list[str]) -> str:
+def measured(scene: Path, truth: Path, options: list[str]) -> str:
     """The cell of a table: fits of both halves of the photographs."""
     outs, errors = [], []
     for which in (0, 1):
         path = scene.parent / f"{which}.xml"
         half(scene, which, path)
-        out = scene.parent / "-".join([str(which), *refine])
-        fitted(path, out, ["--refine", *refine, *options])
+        out = scene.parent / "".join([str(which), *options])
+        fitted(path, out, options)
         command = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth), "--spp", "1", "--align",
                    "rigid"]  # fmt: skip
         errors.append(json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)["normal_mean"])
@@ -172,12 +195,12 @@ def main() -> None:
     for name in arguments.only:
         suspect = SUSPECTS[name]
         scene = write(arguments.capture, arguments.out / arguments.capture.name / re.sub(r"\W+", "_", name), suspect)
-        cells = [measured(scene, truth, refine, options) for refine in (BEFORE, suspect.cure)]
-        rows.append([name, cells[0], f"`{' '.join(suspect.cure)}`", cells[1]])
+        cells = [measured(scene, truth, [*own.split(), *options]) for own in (BEFORE, suspect.cure)]
+        rows.append([name, cells[0], f"`{suspect.cure}`", cells[1]])
         print(*rows[-1], file=sys.stderr, flush=True)
     speed = product_speed(4096, 4096, torch.float32) / 1e9
     print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
-    print(table(["fault", f"`{' '.join(BEFORE)}`: error, apart", "cure", "error, apart"], rows))
+    print(table(["fault", f"`{BEFORE}`: error, apart", "cure", "error, apart"], rows))
 
 
 if __name__ == "__main__":
