@@ -81,7 +81,8 @@ def test_an_iteration_has_what_was_predicted_and_observed(capture):
         assert shown.rgb.shape == seen.rgb.shape == (4, height, width, 3)
         assert shown.coverage.shape == seen.mask.shape == (4, height, width)
         assert {name: value.shape for name, value in shown.material.items()} == {
-            "diffuse": (vertices, 3), "specular": (vertices,), "roughness": (vertices,)
+            "diffuse": (vertices, 3), "specular": (vertices,), "roughness": (vertices,),
+            "diffuse_roughness": (vertices,)
         }  # fmt: skip
         assert not (shown.rgb.requires_grad or shown.coverage.requires_grad or shown.vertices.requires_grad)
         assert not any(value.requires_grad for value in shown.material.values())

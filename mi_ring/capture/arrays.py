@@ -65,11 +65,12 @@ def shots_of(
     full = float(require_numbers(saturation, (), "saturation"))
     if not full > 0:
         raise InputError(f"saturation: is {saturation}, must be above 0")
-    columns = names_of(names, count), images, one_each(cameras, count, "cameras"), one_each(lights, count, "lights")
+    encodings: list[Encoding] = ["linear" if is_linear(encoding, image) else "srgb" for image in images]
+    columns = names_of(names, count), encodings, images, one_each(cameras, count, "cameras"), one_each(lights, count, "lights")
     return tuple(
-        Shot(name, camera_of(camera, image, f"cameras[{k}]"), usable_light(light, f"lights[{k}]"), encoding=encoding,
+        Shot(name, camera_of(camera, image, f"cameras[{k}]"), usable_light(light, f"lights[{k}]"), encoding=own,
              saturation=full, calibrated=calibrated)
-        for k, (name, image, camera, light) in enumerate(zip(*columns))
+        for k, (name, own, image, camera, light) in enumerate(zip(*columns))
     )  # fmt: skip
 
 

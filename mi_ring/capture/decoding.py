@@ -164,7 +164,7 @@ def is_linear(encoding: Encoding, pixels: np.ndarray | LinearImage) -> bool:
 
 
 def has_open_curve(shots: Sequence[Shot]) -> bool:
-    """Return True if photographs are files in sRGB, and the scene file does not tell their camera's curve.
+    """Return True if photographs are sRGB, and the scene file does not tell their camera's curve.
 
     Raises InputError if a file cannot be read.
     """
@@ -172,9 +172,7 @@ def has_open_curve(shots: Sequence[Shot]) -> bool:
         return False
     encodings = set()
     for file, encoding in {(shot.files.filename, shot.encoding) for shot in shots}:
-        if file is None:
-            return False
-        if encoding == "auto":
+        if file and encoding == "auto":
             with reading(file, "an image"):
                 encoding = encoding_of(file)
         encodings.add(encoding)
