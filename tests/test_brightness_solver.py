@@ -85,13 +85,13 @@ def test_a_cone_is_found_whatever_each_photographs_exposure(fit, cone):
 
 @pytest.mark.parametrize("contrast", [1.25, 1.0, 0.9])
 def test_a_contrast_is_found_whatever_each_photographs_exposure(small_capture, contrast):
-    """With it the S-curve, not only another exponent: photographs of other brightness have another slope."""
+    """A flatter curve is not looked for: a surface that is not right yet looks like one."""
     fit, _ = posed(small_capture, refine=("contrast",))
     exposures = torch.linspace(0.4, 1.6, 12)[:, None, None]
     photographed = contrasted((exposures * texture(fit)).clamp(max=0.9), contrast)
     shown = (exposures * texture(fit)).clamp(max=0.9)  # of known powers
     found = solved(fit, shown, photographed, discs(fit, 0.4) < 1, noise=0.02)
-    np.testing.assert_allclose(np.exp(found), [1, 1, 1, contrast], rtol=0.01)
+    np.testing.assert_allclose(np.exp(found), [1, 1, 1, max(contrast, 1)], rtol=0.01)
 
 
 def test_rims_that_are_darker_than_predicted_are_no_contrast(small_capture):

@@ -49,10 +49,8 @@ def step(fit):
     optimisation.backward = noting
     fit.course.iteration = fit.iterations // 2
     it = fit.step()
-    exposure, cone, pose = optimisation.solvers
-    seen = [value for _, value in exposure.seen]
-    found |= {"powers": torch.stack(seen) if seen else torch.zeros(1), "curvature": pose.seen[1],
-              "cone": cone.moments,
+    exposure, brightness, pose = optimisation.solvers
+    found |= {"powers": exposure.measured, "curvature": pose.seen[1], "brightness": brightness.moments,
               "room": calibration.room.vector, "loss": torch.tensor(it.loss),
               "terms": torch.tensor([it.terms.get(name, 0.0) for name in fit.loss.terms]),
               "unexplained": torch.tensor(it.unexplained()),

@@ -129,7 +129,7 @@ def test_it_is_one_self_contained_file(page_file, fitted):
     page = page_file.read_text("utf-8")
     body = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
     sources = re.findall(r'(?:src|href)="([^"]{0,40})', body)
-    assert len(sources) == 2 + 12 * 7 and all(s.startswith("data:") for s in sources)
+    assert len(sources) == 2 + 12 * 8 and all(s.startswith("data:") for s in sources)
     assert page.count("<script") == page.count("</script>") == 4 and "<link" not in page
     assert all(f"{k:03}.png" in body for k in range(12))
     without = report.report_html(fitted)

@@ -192,7 +192,7 @@ class CurveExponent(Unknown):
 class Contrast(Unknown):
     """Logarithm of the steepness of the S-curve in the camera's tone curve. One number for all photographs.
 
-    Gradients ignore it.
+    It is at least 0. Gradients ignore it.
     """
 
     changes = "recording"

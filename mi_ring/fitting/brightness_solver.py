@@ -104,6 +104,7 @@ class BrightnessSolver(torch.optim.Optimizer):
             # Without the column of another exponent: it is almost the same.
             width = calibration.widths["contrast"]
             contrast = estimate(known, CONTRAST, CONE + AWAY, torch.tensor([width]), DOUBT_OF_CONTRAST)
+            contrast = contrast.clamp(min=0)  # cameras raise it; a surface that is not right yet looks like a lower one
             calibration.get_parameter("contrast").add_(rate * (contrast[0] - now[3]) / width)
 
 
