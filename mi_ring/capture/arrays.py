@@ -66,13 +66,8 @@ def shots_of(
     if not full > 0:
         raise InputError(f"saturation: is {saturation}, must be above 0")
     encodings: list[Encoding] = ["linear" if is_linear(encoding, image) else "srgb" for image in images]
-    columns = (
-        names_of(names, count),
-        encodings,
-        images,
-        one_each(cameras, count, "cameras"),
-        one_each(lights, count, "lights"),
-    )
+    each = one_each(cameras, count, "cameras"), one_each(lights, count, "lights")
+    columns = names_of(names, count), encodings, images, *each
     return tuple(
         Shot(name, camera_of(camera, image, f"cameras[{k}]"), usable_light(light, f"lights[{k}]"), encoding=own,
              saturation=full, calibrated=calibrated)
