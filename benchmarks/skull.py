@@ -6,11 +6,14 @@ PHOTOS is the folder of all 66 JPEG files. Every eighth photograph, from the fif
 out of the search for cameras and masks. OUT gets the capture, the fit and predictions of the held-out photographs, from
 which `docs/make_skull.py` makes pictures.
 
-If the folder `shared` is beside the checkout, it prints the errors of the cameras against COLMAP with the full-size
+Prints how much photographs from almost the same place differ in brightness, and what of it the powers explain. If the
+folder `shared` is beside the checkout, it also prints the errors of the cameras against COLMAP with the full-size
 photographs, the overlap of the masks, and PSNR of the held-out photographs.
 """
 
 import argparse
+import itertools
+import json
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -20,12 +23,14 @@ import numpy as np
 from PIL import Image
 from trimesh.registration import procrustes
 
+from mi_ring.capture.loading import load_capture
 from mi_ring.system.files import write_file
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 REFERENCE = SHARED / "data/real/flash_skull"
 
 EVERY = 8  #: one of so many photographs is held out
+NEAR = np.cos(np.radians(12)), 0.05  #: cameras at almost the same place: cosine of their angle, log of their distances
 
 
 def run(*arguments: object) -> None:
@@ -100,6 +105,34 @@ def masks_off(capture: Path) -> str:
     return f"masks: intersection over union {np.mean(overlaps):.3f}, worst {min(overlaps):.3f}"
 
 
+def neighbours(result: Path) -> str:
+    """How much photographs from almost the same place differ in brightness, and how much with their powers taken out.
+
+    Brightness is the median of log radiance at pixels of the mask that are not clipped, times the squared distance.
+    """
+    capture = load_capture(result / "scene.xml")
+    powers = json.loads((result / "calibration.json").read_text())["photographs"]
+    center, _ = capture.sphere()
+    chosen = [k for k, name in enumerate(capture.names) if "power" in powers.get(name, {})]
+    from_center = np.array([capture.shots[k].camera.position - center for k in chosen])
+    distances = np.linalg.norm(from_center, axis=1)
+    directions = from_center / distances[:, None]
+    levels = []
+    for k, distance in zip(chosen, distances):
+        seen = capture.observe([k], 8)
+        inside = (seen.mask > 0.99) & ~seen.clipped.any(-1) & (seen.rgb > 0).all(-1)
+        levels.append(seen.rgb[inside].log().median(0).values.numpy() + 2 * np.log(distance))
+    found = np.log([powers[capture.names[k]]["power"] for k in chosen])
+    pairs = [(a, b) for a, b in itertools.combinations(range(len(chosen)), 2)
+             if directions[a] @ directions[b] > NEAR[0] and abs(np.log(distances[a] / distances[b])) < NEAR[1]]  # fmt: skip
+    a, b = np.array(pairs).T
+    brighter, stronger = np.array(levels)[a] - np.array(levels)[b], found[a] - found[b]
+    before, after = (100 * np.sqrt(np.square(part).mean(0)) for part in (brighter, brighter - stronger))
+    colours = "red {:.1f} %, green {:.1f} %, blue {:.1f} %"
+    return (f"{len(pairs)} pairs of photographs from almost the same place differ in brightness by "
+            f"{colours.format(*before)}; with the powers taken out by {colours.format(*after)}")  # fmt: skip
+
+
 def main() -> None:
     """The benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -118,6 +151,7 @@ def main() -> None:
     result = capture / f"fit_{options.preset}"
     run("mi_ring.fit", capture / "scene.xml", "--preset", options.preset, "--holdout", EVERY, "--out", result,
         *options.fit)  # fmt: skip
+    print(neighbours(result), flush=True)
     run("mi_ring.render", result, held_out(capture, result), result / "held_out")
     if REFERENCE.is_dir():
         photographs = capture / "reference"
