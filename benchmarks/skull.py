@@ -123,13 +123,14 @@ def neighbours(result: Path) -> str:
         inside = (seen.mask > 0.99) & ~seen.clipped.any(-1) & (seen.rgb > 0).all(-1)
         levels.append(seen.rgb[inside].log().median(0).values.numpy() + 2 * np.log(distance))
     found = np.log([powers[capture.names[k]]["power"] for k in chosen])
-    pairs = [(a, b) for a, b in itertools.combinations(range(len(chosen)), 2)
-             if directions[a] @ directions[b] > NEAR[0] and abs(np.log(distances[a] / distances[b])) < NEAR[1]]  # fmt: skip
-    a, b = np.array(pairs).T
+    a, b = np.array([*itertools.combinations(range(len(chosen)), 2)]).T
+    near = (directions[a] * directions[b]).sum(1) > NEAR[0]
+    near &= np.abs(np.log(distances[a] / distances[b])) < NEAR[1]
+    a, b = a[near], b[near]
     brighter, stronger = np.array(levels)[a] - np.array(levels)[b], found[a] - found[b]
     before, after = (100 * np.sqrt(np.square(part).mean(0)) for part in (brighter, brighter - stronger))
     colours = "red {:.1f} %, green {:.1f} %, blue {:.1f} %"
-    return (f"{len(pairs)} pairs of photographs from almost the same place differ in brightness by "
+    return (f"{len(a)} pairs of photographs from almost the same place differ in brightness by "
             f"{colours.format(*before)}; with the powers taken out by {colours.format(*after)}")  # fmt: skip
 
 
