@@ -1,5 +1,6 @@
 """Scenes to tensors: decoding, masks, the normalising sphere, and one clear line for what is wrong."""
 
+import io
 import re
 import shutil
 from dataclasses import replace
@@ -42,6 +43,31 @@ def test_sixteen_bits_are_linear_and_all_of_them_count():
     linear, clipped = decoding.decode(image, linear=True, saturation=0.5)
     np.testing.assert_allclose(linear, image / 65535.0, rtol=1e-6)
     assert clipped.tolist() == [[[False, False, False], [True, True, True]]]
+
+
+@pytest.mark.parametrize(("form", "quality"), [("JPEG", 95), ("JPEG", 40), ("WEBP", 80)])
+def test_what_lossy_coding_moves_below_full_scale_is_clipped(form, quality):
+    """Of what a bright spot clips, the values of full scale alone are 87 % at most."""
+    y, x = np.mgrid[:240, :320][..., None] / 240
+    noise = 1 + 0.05 * np.random.default_rng(3).normal(size=(240, 320, 1))
+    light = 1.9 * np.exp(-3 * ((x - 0.6) ** 2 + (y - 0.4) ** 2)) * [1, 0.9, 0.8] * noise
+    exact, file = (255 * light.clip(0, 1) + 0.5).astype(np.uint8), io.BytesIO()
+    Image.fromarray(exact).save(file, form, quality=quality)
+    lossy = np.asarray(Image.open(file).convert("RGB"))
+    clipped = lossy >= 255 * decoding.clip_value(lossy, 1.0) - 0.5
+    assert (lossy == 255)[light > 1].mean() < 0.88 and clipped[light > 1].mean() > 0.94
+    assert clipped[light < 0.9].mean() < 0.001
+    assert decoding.clip_value(exact, 1.0) == 1 and decoding.clip_value(lossy, 0.9) == 0.9
+    assert decoding.clip_value(lossy.astype(np.float32), 1.0) == 1
+
+
+def test_values_of_bright_surfaces_are_not_clipped():
+    """Values that grow toward full scale, and a white of 254, are no clipped pixels of 255."""
+    growing = np.repeat(np.arange(256, dtype=np.uint8), 20 + np.arange(256) ** 2 // 100).reshape(-1, 1)
+    growing = np.repeat(growing[:, :, None], 3, 2)
+    assert decoding.clip_value(growing, 1.0) == 1
+    white = np.where(growing == 255, np.uint8(254), growing)
+    assert decoding.clip_value(white, 1.0) == 1
 
 
 def test_srgb_encoding_inverts_decoding():

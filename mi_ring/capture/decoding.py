@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from mi_ring.colour_profiles import srgb_to_linear
@@ -12,6 +13,9 @@ from mi_ring.foreign import reading
 from mi_ring.image_headers import encoding_of, image_size
 from mi_ring.images import contrasted, linear_to_srgb, mask_values, read_image
 from mi_ring.scene.shot import Encoding, Shot
+
+COMMON = 224, 248  #: the 8-bit values from the first to before the second are those of pixels that are not clipped
+FREQUENT = 1.5  #: values are clipped that are so many times as frequent
 
 
 class LinearImage(NamedTuple):
@@ -61,6 +65,23 @@ def decode(
     if image.dtype == np.float32:
         return lookup, value >= saturation
     return lookup[image], image >= np.searchsorted(value, np.float32(saturation))
+
+
+def clip_value(image: np.ndarray | LinearImage, saturation: float) -> float:
+    """Return the encoded value (1 = full scale) from which a pixel of a photograph (H, W, 3) is clipped.
+
+    This is `saturation`, unless it is 1 and the pixels have 8 bits. Lossy coding moves clipped pixels to values a
+    little below full scale, which are then more frequent than the values below them. These values count as clipped.
+    """
+    if saturation != 1 or isinstance(image, LinearImage) or image.dtype != np.uint8:
+        return saturation
+    pixels = np.ascontiguousarray(image)
+    counts = sum(cv2.calcHist([pixels], [k], None, [256], [0, 256]).ravel() for k in range(image.shape[2]))
+    usual = FREQUENT * counts[slice(*COMMON)].mean()
+    lowest = 255
+    while lowest > COMMON[1] and min(counts[255], counts[lowest - 1]) > usual:
+        lowest -= 1
+    return lowest / 255
 
 
 def shade(shot: Shot, scale: int = 1) -> np.ndarray | float:
@@ -124,7 +145,9 @@ def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
         raise InputError(f'{scene}: photograph "{shot.name}", ambient: cannot be subtracted if the camera has a curve; '
                          "leave out gamma and contrast, or subtract it yourself")  # fmt: skip
     pictures = [image, read_colours(shot, "ambient", scene)]
-    (lit, clipped), (ambient, too) = (decode(p, is_linear(shot.encoding, p), shot.saturation) for p in pictures)
+    (lit, clipped), (ambient, too) = (
+        decode(p, is_linear(shot.encoding, p), clip_value(p, shot.saturation)) for p in pictures
+    )
     difference = lit - ambient  # noise about 0, negative values too
     if shot.encoding == "srgb":
         difference = linear_to_srgb(difference.clip(min=0))

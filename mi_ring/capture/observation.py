@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mi_ring.capture.decoding import LinearImage, decode, is_linear, shade
+from mi_ring.capture.decoding import LinearImage, clip_value, decode, is_linear, shade
 from mi_ring.images import box_filter
 from mi_ring.scene.shot import Shot
 
@@ -60,7 +60,7 @@ def observed(
     where a pixel is ignored; None: all pixels are valid.
     """
     curve = shot.response.gamma, shot.response.contrast
-    linear, clipped = decode(image, is_linear(shot.encoding, image), shot.saturation, *curve)
+    linear, clipped = decode(image, is_linear(shot.encoding, image), clip_value(image, shot.saturation), *curve)
     linear = linear / shade(shot)
     coverage = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
     shown = None

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from mi_ring.capture.brightness_masks import bright, with_masks_by_brightness
 from mi_ring.capture.capture import Capture
-from mi_ring.capture.decoding import LinearImage, decode, is_linear, read_mask, read_photograph
+from mi_ring.capture.decoding import LinearImage, clip_value, decode, is_linear, read_mask, read_photograph
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.images import ROWS, box_filter
 from mi_ring.scene.shot import Shot, Window
@@ -211,6 +211,7 @@ def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
     photograph of 8 bits, otherwise float32.
     """
     image = read()
+    clipped_from = clip_value(image, shot.saturation)
     kept = np.float16 if image.dtype == np.uint8 else np.float32
     blocks, (left, top), (width, height) = window.blocks, window.corner, window.extent
     radiance = np.empty((height // blocks, width // blocks, 3), np.float32)
@@ -218,7 +219,7 @@ def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
     rows = max(1, ROWS // blocks)
     for first in range(0, len(radiance), rows):
         part = image[top + blocks * first : top + min(blocks * (first + rows), height), left : left + width]
-        linear, over = decode(part, is_linear(shot.encoding, part), shot.saturation, shot.response.gamma,
+        linear, over = decode(part, is_linear(shot.encoding, part), clipped_from, shot.response.gamma,
                               shot.response.contrast)  # fmt: skip
         radiance[first : first + rows] = averaged(linear, blocks)
         if over.any():

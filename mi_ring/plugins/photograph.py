@@ -41,7 +41,9 @@ class Photograph(mi.Sensor):
     ``encoding``     string       ``srgb`` or ``linear``; linear data of 8 bits is refused. Default:
                                   ``srgb`` for 8-bit files, ``linear`` for 16-bit PNG/TIFF and EXR
     ``saturation``   float        encoded value (1 = full scale) from which a pixel is clipped. A
-                                  clipped pixel only says "at least this bright". Default: 1
+                                  clipped pixel only says "at least this bright". Default: 1; of 8-bit
+                                  files, values just below 1 to which lossy coding moves clipped pixels
+                                  count, too
     ``gamma``        float        exponent of the camera's curve: a pixel, decoded by ``encoding``, is
                                   radiance to this power. Default: 1
     ``contrast``     float        exponent c of the camera's S-curve: after ``gamma``, an sRGB value v

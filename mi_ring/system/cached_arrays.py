@@ -14,7 +14,7 @@ import torch
 from mi_ring.system import cache, files
 
 #: Change it if the content of cached files changes, or if their computation does. Files of another format are not used.
-FORMAT = "4"
+FORMAT = "5"
 LIBRARIES = "numpy", "scipy", "scikit-image", "trimesh", "gpytoolbox", "torch"  #: which compute surfaces
 
 
