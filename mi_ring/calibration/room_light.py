@@ -15,6 +15,9 @@ DIM = 0.3  #: radiance, in units of the exposure, that is added to the scale of 
 ROBUST = 0.2  #: relative error above which an error counts linearly
 OBJECT = 0.99  #: coverage of pixels that are compared, at least
 COMPARED_WIDTH = 64  #: largest width of the pictures that are compared [px]
+#: A room beside a flash whose light is a smaller share of what photographs show is not believed: another material may
+#: look like it.
+DOUBT = 0.03
 BESIDE_FLASH = 2  #: order of the harmonics of a room beside a flash: photographs tell hardly more
 FINE = 0.3  #: progress from which the only light has its full order
 
@@ -27,6 +30,7 @@ class RoomLight(nn.Module):
     harmonics: Tensor  #: (BASIS, 3) as found
     matrix: Tensor  #: (3, BASIS, BASIS) of the normal equations, one for each colour
     vector: Tensor  #: (3, BASIS) right sides of the normal equations
+    shown: Tensor  #: (3, BASIS + 1) products of the photographs with the harmonics' light, and with themselves
 
     def __init__(self, given: Tensor, exposure: float, frames: Iterable[str] = ("world",), alone: bool = False) -> None:
         """Start from the harmonics `given` (BASIS, 3). `exposure`: mean radiance of the object.
@@ -43,11 +47,13 @@ class RoomLight(nn.Module):
         self.register_buffer("harmonics", given.clone())
         self.register_buffer("matrix", torch.zeros(3, BASIS, BASIS))
         self.register_buffer("vector", torch.zeros(3, BASIS))
+        self.register_buffer("shown", torch.zeros(3, BASIS + 1))
 
     def forget(self) -> None:
         """Set the normal equations to 0, so that earlier photographs no longer count. The harmonics do not change."""
         self.matrix.zero_()
         self.vector.zero_()
+        self.shown.zero_()
 
     @torch.no_grad()
     def solve(
@@ -76,23 +82,28 @@ class RoomLight(nn.Module):
             return pooled(pictures, around.factor * coarser)[:, :height, :width]
 
         inside = torch.minimum(small(counted.float()[..., None])[..., 0], alpha) > OBJECT
-        missing, light = small(observed - predicted)[inside], small(observed)[inside].mean(-1)
+        missing, seen = small(observed - predicted)[inside], small(observed)[inside]
         which, now = around.harmonics, self.harmonics[around.harmonics]
         basis = torch.stack([pooled(harmonic, coarser)[inside] for harmonic in around.transfer])  # (which, n, 3)
         lit = torch.einsum("jnhwc,jc->nhwc", around.unoccluded, now)
         missing = missing + pooled(lit, coarser)[inside]
-        scale = light + DIM * self.exposure
+        scale = seen.mean(-1) + DIM * self.exposure
         left = missing - torch.einsum("jnc,jc->nc", basis, now)
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
         matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
-        equations = total(torch.cat([matrix, vector[..., None]], -1))
+        shown = torch.einsum("jnc,nc,n->cj", torch.cat([basis, seen[None]]), seen, weight)
+        equations = total(torch.cat([matrix, vector[..., None], shown[:, :-1, None]], -1))
+        brightness = total(shown[:, -1])
         if not bool(equations.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
             return
         self.matrix *= MEMORY
         self.vector *= MEMORY
-        self.matrix[:, torch.tensor(which)[:, None], which] += equations[..., :-1]
-        self.vector[:, which] += equations[..., -1]
+        self.shown *= MEMORY
+        self.matrix[:, torch.tensor(which)[:, None], which] += equations[..., :-2]
+        self.vector[:, which] += equations[..., -2]
+        self.shown[:, which] += equations[..., -1]
+        self.shown[:, -1] += brightness
         told = self.matrix.diagonal(dim1=1, dim2=2)[:, which].mean(1)
         ridge = RIDGE * told[:, None, None] * torch.eye(BASIS).to(self.matrix)
         if bool((ridge.amax((1, 2)) > 0).all()):
@@ -100,6 +111,23 @@ class RoomLight(nn.Module):
             right = self.vector[..., None] - self.matrix @ self.given.T[..., None]
             more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
             self.harmonics = self.given.clone()
-            self.harmonics[free] += more.T
+            self.harmonics[free] += more.T if self.alone else self.believed(more, free) * more.T
             # A room with negative mean radiance is impossible: another part of the model is too bright then.
             self.harmonics[:, self.harmonics[0] < 0] = 0.0
+
+    def believed(self, more: Tensor, free: list[int]) -> float:
+        """Return the factor, 0 to 1, of room light that is believed. `more` (3, J): of the harmonics `free`, as solved.
+
+        It depends on the mean share of this light in the photographs and on its error: colours that differ tell how
+        large that is, but it is at least `DOUBT`. The form is that of "Estimation with quadratic loss" (James and Stein
+        1961).
+        """
+        shares = (more * self.shown[:, free]).sum(1) / self.shown[:, -1].clamp(min=1e-12)
+        share, error = float(shares.mean()), float(shares.var() / 3) + DOUBT**2
+        return max(0.0, 1 - error / share**2) if share > 0 else 0.0
+
+    def doubted(self) -> Tensor:
+        """Return the first harmonic (3,) of a room alike from all sides, as faint as one that is not believed."""
+        if self.alone:
+            return self.harmonics.new_zeros(3)
+        return DOUBT * self.shown[:, -1] / self.shown[:, 0].clamp(min=1e-12)

@@ -76,7 +76,7 @@ def clip_value(image: np.ndarray | LinearImage, saturation: float) -> float:
     if saturation != 1 or isinstance(image, LinearImage) or image.dtype != np.uint8:
         return saturation
     pixels = np.ascontiguousarray(image)
-    counts = sum(cv2.calcHist([pixels], [k], None, [256], [0, 256]).ravel() for k in range(image.shape[2]))
+    counts = np.sum([cv2.calcHist([pixels], [k], None, [256], [0, 256]).ravel() for k in range(image.shape[2])], 0)
     usual = FREQUENT * counts[slice(*COMMON)].mean()
     lowest = 255
     while lowest > COMMON[1] and min(counts[255], counts[lowest - 1]) > usual:

@@ -1,10 +1,11 @@
-"""Computes the standard deviations of the unknowns of calibration. Surface and material count as fixed.
+"""Computes the standard deviations of the unknowns of calibration. Surface and material are unknown, too.
 
 The covariance follows from least squares at the solution: from the derivatives of the photographs with respect to each
 unknown, and from the errors of the predictions ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section
-8.1).
+8.1). Each patch of the surface has unknowns of its own, which are eliminated (the same, section 6.1).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.calibration.calibration import Calibration
+from mi_ring.fitting.local_unknowns import Patches
 from mi_ring.fitting.losses import perceived
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
@@ -23,8 +25,10 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 
 COMPARED_WIDTH, SPP = 96, 8  #: of the compared pictures: largest width [px], samples per pixel
+DIM = 0.01  #: step of the room's light [exposure]
 STEP = 0.2  #: of the unknowns to either side [standard deviations of their priors]
 BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
+NONE = 1e-9  #: precision of a prior that says nothing
 
 
 class Layout:
@@ -35,6 +39,16 @@ class Layout:
         for name in calibration.widths:
             self.first[name] = self.count
             self.count += getattr(calibration, name).numel()
+        #: numbers of the room's harmonics that are unknown; R, G, B of each
+        self.room = calibration.room.which if "ambient" in calibration.refined else []
+        self.first["ambient"] = self.count
+        self.count += 3 * len(self.room)
+
+    def precision(self) -> np.ndarray:
+        """Return the precision of the prior of each parameter. The room's light has none."""
+        result = np.ones(self.count)
+        result[self.first["ambient"] :] = NONE
+        return result
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
         """List the components of all unknowns that affect the photographs `index` (n,): (unknown, component, places).
@@ -52,50 +66,67 @@ class Layout:
 
 @torch.no_grad()
 def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
-    """Compute the standard deviation of each refined unknown of calibration, except the room's light.
+    """Compute the standard deviation of each refined unknown of calibration.
 
-    Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown; {} if there are none. All
-    fitted photographs are rendered. `level`: level of the rendered mesh.
+    Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown; {} if there are none. The
+    room's light is "ambient": (3,), the deviations of the first harmonic's R, G, B. All fitted photographs are
+    rendered. `level`: level of the rendered mesh.
     """
-    calibration = model.calibration
+    calibration, ring = model.calibration, model.ring
     assert calibration is not None
     layout = Layout(calibration)
     if not layout.count:
         return {}
     surface = renderer.show(model, level)
-    colours, silhouettes = Equations(layout.count), Equations(layout.count)
+    patches = Patches(surface, ring.domain.sample(level)[0], float(ring.radius), ring.brdf_net.bsdf_parameters)
+    colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))
     for index in problem.capture.together(problem.fitted):
         scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
-        group = CovarianceGroup(problem, calibration, surface, model.ring.indirect, index, scale)
+        group = CovarianceGroup(problem, calibration, surface, patches, ring.indirect, index, scale)
         compare(group, layout, colours, silhouettes)
     calibration.relight(surface)  # as it was
-    precision = np.eye(layout.count) + colours.information() + silhouettes.information()
+    precision = np.diag(layout.precision()) + colours.information() + silhouettes.information()
     spread = np.sqrt(np.diag(np.linalg.inv(precision)))
-    return {
+    result = {
         name: width * spread[layout.first[name] :][: getattr(calibration, name).numel()]
         .reshape(getattr(calibration, name).shape)
         for name, width in calibration.widths.items()
     }  # fmt: skip
+    if layout.room:
+        result["ambient"] = spread[layout.first["ambient"] :][:3]
+    return result
 
 
 class Equations:
     """The normal equations of least squares for N = `count` parameters, and the variance of the residuals.
 
-    Photographs are added one by one.
+    Photographs are added one by one. Each of the `patches` of the surface has L more unknowns of its own.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, patches: int = 0, of_each: int = 0) -> None:
         self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
+        self.own = np.zeros((patches, of_each, of_each))  #: products of a patch's unknowns
+        self.cross = np.zeros((patches, of_each, count), np.float32)  #: and of these with the parameters
 
-    def add(self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray) -> None:
+    def add(
+        self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray, local: Tensor | None = None,
+        patch: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """Add one photograph to the equations.
 
         `slopes` (K, H, W, C): derivatives of the prediction with respect to K parameters. `places` (K,): their indices
         among all N parameters. `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: True for pixels
-        to use.
+        to use. `local` (L, H, W, C): derivatives with respect to the unknowns of the patch (H, W) of each pixel.
         """
-        slopes = slopes[:, counted].flatten(1).double()
-        np.add.at(self.matrix, np.ix_(places, places), (slopes @ slopes.T).numpy())
+        slopes = slopes[:, counted].double()
+        flat = slopes.flatten(1)
+        np.add.at(self.matrix, np.ix_(places, places), (flat @ flat.T).numpy())
+        if local is not None and patch is not None:
+            own, at = local[:, counted].double(), patch[counted.numpy()]
+            np.add.at(self.own, at, torch.einsum("apc,bpc->pab", own, own).numpy())
+            products = np.zeros((len(self.cross), len(own), len(places)))
+            np.add.at(products, at, torch.einsum("apc,bpc->pab", own, slopes).numpy())
+            self.cross[:, :, places] += products.astype(np.float32)
         height, width, channels = error.shape
         error = torch.where(counted[..., None], error, 0.0).double()
         error = F.pad(error, (0, 0, 0, -width % BLOCK, 0, -height % BLOCK))
@@ -106,9 +137,16 @@ class Equations:
     def information(self) -> np.ndarray:
         """Compute the Fisher information matrix (N, N) of all added photographs.
 
-        It is the inverse of their covariance.
+        It is the inverse of the covariance of the N parameters, whatever the unknowns of the patches are. These have
+        priors of standard deviation 1.
         """
-        return self.matrix * (self.pixels / self.squares if self.squares else 0.0)
+        if not self.squares:
+            return 0 * self.matrix
+        weight = self.pixels / self.squares
+        own = np.eye(self.own.shape[1]) + weight * self.own
+        solved = np.linalg.solve(own, weight * self.cross)
+        count = len(self.matrix)
+        return weight * (self.matrix - self.cross.reshape(-1, count).T @ solved.reshape(-1, count))
 
 
 @dataclass(frozen=True)
@@ -121,6 +159,7 @@ class CovarianceGroup:
     problem: Problem
     calibration: Calibration
     surface: Surface
+    patches: Patches
     indirect: bool  #: Is interreflection predicted?
     index: np.ndarray
     scale: int
@@ -144,23 +183,41 @@ class CovarianceGroup:
         shadows = self.problem.config.shadows and self.problem.capture.shadows
         return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
 
-    def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor]:
-        """Render interreflection and room light. Returns both as linear radiance (n, H, W, 3).
+    def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Render interreflection and room light. Returns both as linear radiance (n, H, W, 3), and the transfer.
 
         Light that the fit does not use is 0. `lit` (n, H, W, 3): direct light. `coverage` (n, H, W): the object's share
-        of each pixel.
+        of each pixel. The transfer (J, n, H, W, 3) is radiance in a room of one harmonic, of those that are unknown.
         """
         calibration, indirect = self.calibration, self.indirect
-        bounced, room_light = torch.zeros_like(lit), torch.zeros_like(lit)
-        room = calibration.room_harmonics()
-        if indirect or room.any():
+        bounced, room_light, transfer = torch.zeros_like(lit), torch.zeros_like(lit), lit.new_zeros(0, *lit.shape)
+        room, unknown = calibration.room_harmonics(), "ambient" in calibration.refined
+        if indirect or room.any() or unknown:
             photographs = self.photographs()
             around = GlobalIllumination.of(self.surface, photographs, coverage.to(self.problem.device), 1, paths=SPP,
                                          indirect=indirect, harmonics=calibration.room.which)  # fmt: skip
             bounced = around.interreflection.cpu() if indirect else bounced
             added = around.occlusion if photographs.dark else around.room_light
             room_light = added(room.to(self.problem.device)).cpu() if room.any() else room_light
-        return bounced, room_light
+            if unknown:
+                transfer = torch.stack([around.upsampled(one).cpu() for one in around.transfer])
+        return bounced, room_light, transfer
+
+    def local_slopes(self, picture: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+        """Return derivatives with respect to the unknowns of each pixel's patch: (L, n, H, W, 3), and (1, n, H, W).
+
+        The first are of `picture`, a function of direct light, the second of the coverage: it depends on the last.
+        """
+        slopes: list[Tensor] = []
+        for unknown in self.patches.unknowns:
+            sides: list[tuple[Tensor, Tensor]] = []
+            for step in (STEP, -STEP):
+                with self.patches.changed(unknown, step):
+                    lit, coverage = self.direct()
+                sides.append((picture(lit), coverage))
+            slope, moving = ((plus - minus) / (2 * STEP) for plus, minus in zip(*sides))
+            slopes += [slope * channel for channel in torch.eye(3)] if unknown.channels == 3 else [slope]
+        return torch.stack(slopes), moving[None]
 
 
 def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes: Equations) -> None:
@@ -172,7 +229,7 @@ def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes
     problem, calibration, index = at.problem, at.calibration, at.index
     seen = problem.capture.observe(index, at.scale)
     lit, coverage = at.direct()
-    bounced, room_light = at.other(lit, coverage)
+    bounced, room_light, transfer = at.other(lit, coverage)
 
     def picture(lit: Tensor, bounced: Tensor = bounced, gain: Tensor | float = 1.0) -> Tensor:
         light = gain * (lit + bounced + room_light)
@@ -201,13 +258,21 @@ def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes
     for unknown in unknowns:
         sides = beside(*unknown, STEP), beside(*unknown, -STEP)
         slopes.append([(plus - minus) / (2 * STEP) for plus, minus in zip(*sides)])
+    for harmonic in transfer:
+        plus, minus = (picture(lit + sign * DIM * problem.exposure * harmonic) for sign in (1, -1))
+        slope = (plus - minus) / (2 * DIM * problem.exposure)
+        slopes += [[slope * channel, torch.zeros_like(coverage)] for channel in torch.eye(3)]
     changing, covering = (torch.stack(part) for part in zip(*slopes))
-    own = np.stack([places for *_, places in unknowns], 1)
+    room = layout.first["ambient"] + np.arange(3 * len(transfer))
+    own = np.column_stack([*(places for *_, places in unknowns), np.tile(room, (len(index), 1))])
+    local, moving = at.local_slopes(picture)
+    patch = at.patches.seen(at.photographs())
     error, off = picture(lit) - perceived(seen.rgb, problem.exposure, "log"), coverage - seen.mask
     surely = seen.surely(coverage) & ~seen.clipped.any(-1)
     known = torch.ones_like(surely) if seen.valid is None else seen.valid.bool()
     outlined = (covering.abs().amax(0) > 0) | (off != 0)  # pixels away from outlines have no error and do not count
     for n in range(len(index)):
-        colours.add(changing[:, n], error[n], surely[n], own[n])
+        colours.add(changing[:, n], error[n], surely[n], own[n], local[:, n], patch[n])
         if seen.masked[n] and problem.capture.threshold is None:
-            silhouettes.add(covering[:, n, ..., None], off[n, ..., None], (known & outlined)[n], own[n])
+            silhouettes.add(covering[:, n, ..., None], off[n, ..., None], (known & outlined)[n], own[n],
+                            moving[:, n, ..., None], patch[n])  # fmt: skip

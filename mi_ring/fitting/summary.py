@@ -19,7 +19,7 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
     `refined`: the calibrated capture. `deviations`: a dict from names of unknowns to their standard deviations. Returns
     a dict with these keys. `refined`: list of the refined options. `light`: kind of the light. `unknowns`: a dict with,
     for each unknown that photographs share, its meaning (`what`), its value `before` and `after` the fit, and its
-    standard deviation `std` for a fixed surface (not for the room's light). `photographs`: a dict with, for each fitted
+    standard deviation `std`. `photographs`: a dict with, for each fitted
     photograph, how far the object has moved in it (`moved_px`) and the values of its own unknowns.
     """
     calibration, ring = model.calibration, model.ring
@@ -40,8 +40,11 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
         what = f"light of the room on the object, as shares of the {by}'s: red, green, blue"
         if capture.photographs.dark:
             what = "mean radiance of the environment: red, green, blue"
-        before, after = (calibration.room_share(light).tolist() for light in (room.given, room.harmonics))
-        unknowns["ambient"] = {"what": what, "before": before, "after": after, "harmonics": room.harmonics.tolist()}
+        mean = torch.zeros_like(room.harmonics)
+        mean[0] = torch.hypot(torch.from_numpy(deviations["ambient"]).to(mean), room.doubted())
+        before, after, spread = (calibration.room_share(light).tolist() for light in (room.given, room.harmonics, mean))
+        unknowns["ambient"] = {"what": what, "before": before, "after": after, "std": spread,
+                               "harmonics": room.harmonics.tolist()}  # fmt: skip
 
     corners = ring.center.cpu().numpy() + float(ring.radius) * np.concatenate([np.eye(3), -np.eye(3)])
     single = {name: unknown for name, unknown in calibration.unknowns.items() if unknown.per == "photograph"}

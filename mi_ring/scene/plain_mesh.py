@@ -5,7 +5,7 @@ import mitsuba as mi
 from mi_ring.scene.alignment import to_flat
 
 # Mitsuba's names of mesh parameters. Mitsuba 3.10 renames them.
-POSITIONS, FACES = "vertex_positions", "faces"
+POSITIONS, NORMALS, FACES = "vertex_positions", "vertex_normals", "faces"
 
 
 def mesh_of(vertices, faces, normals: bool = True, uv=None) -> mi.Mesh:
