@@ -51,7 +51,7 @@ def solved(fit, picture, photographed, inside, rounds=40, noise=0.1):
     """
     calibration, random = fit.model.calibration, torch.Generator().manual_seed(1)
     solver, directions = BrightnessSolver(calibration), rays(fit)
-    batch = SimpleNamespace(progress=0.5, photographs=INDEX, all_photographs=INDEX, scale=1,
+    batch = SimpleNamespace(progress=0.4, photographs=INDEX, all_photographs=INDEX, scale=1,
                             share=ALONE.share(len(INDEX)), stage=Stage(2, 28, 0, 9))  # fmt: skip
     inside = inside.float()
     for _ in range(rounds):

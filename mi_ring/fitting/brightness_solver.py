@@ -22,6 +22,9 @@ LEAST_TILT = 0.1  #: and at least this
 #: wrong material, may explain as much.
 DOUBT_OF_CONE, DOUBT_OF_CONTRAST = 0.05, 0.01
 RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
+#: Progress of the fit from which photographs are no longer compared. The flash's place follows the gradient of another
+#: measure of error than least squares, and changes brightness almost like a tilt: together they would drift without end.
+SETTLED = 0.5
 CONE, CONTRAST, SHOWN, AWAY = [0, 1, 2], [3], [4], [5]  #: numbers of the columns of `columns`
 
 
@@ -56,7 +59,7 @@ class BrightnessSolver(torch.optim.Optimizer):
 
         Only differences within a photograph and colour count, so its exposure does not matter.
         """
-        if it.progress < START or it.stage.settles:
+        if not START <= it.progress < SETTLED:
             return
         index, rig = it.batch.photographs, self.calibration.rig
         directions = self.calibration.directions(index, it.batch.scale)
