@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.sparse import csr_matrix
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -123,10 +124,11 @@ class Equations:
         np.add.at(self.matrix, np.ix_(places, places), (flat @ flat.T).numpy())
         if local is not None and patch is not None:
             own, at = local[:, counted].double(), patch[counted.numpy()]
-            np.add.at(self.own, at, torch.einsum("apc,bpc->pab", own, own).numpy())
-            products = np.zeros((len(self.cross), len(own), len(places)))
-            np.add.at(products, at, torch.einsum("apc,bpc->pab", own, slopes).numpy())
-            self.cross[:, :, places] += products.astype(np.float32)
+            summed = csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (len(self.own), len(at)))
+            products = [torch.einsum("apc,bpc->pab", own, other).numpy() for other in (own, slopes)]
+            alone, together = ((summed @ part.reshape(len(at), -1)).reshape(-1, *part.shape[1:]) for part in products)
+            self.own += alone
+            self.cross[:, :, places] += together
         height, width, channels = error.shape
         error = torch.where(counted[..., None], error, 0.0).double()
         error = F.pad(error, (0, 0, 0, -width % BLOCK, 0, -height % BLOCK))
