@@ -26,10 +26,9 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 
 COMPARED_WIDTH, SPP = 96, 8  #: of the compared pictures: largest width [px], samples per pixel
-DIM = 0.01  #: step of the room's light [exposure]
+ROOM, DIM = 10.0, 0.01  #: prior and step of the room's light [exposure]
 STEP = 0.2  #: of the unknowns to either side [standard deviations of their priors]
 BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
-NONE = 1e-9  #: precision of a prior that says nothing
 
 
 class Layout:
@@ -46,9 +45,9 @@ class Layout:
         self.count += 3 * len(self.room)
 
     def precision(self) -> np.ndarray:
-        """Return the precision of the prior of each parameter. The room's light has none."""
+        """Return the precision of the prior of each parameter (N,)."""
         result = np.ones(self.count)
-        result[self.first["ambient"] :] = NONE
+        result[self.first["ambient"] :] = 1 / (ROOM * self.calibration.rig.exposure) ** 2
         return result
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
@@ -87,7 +86,7 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
         compare(group, layout, colours, silhouettes)
     calibration.relight(surface)  # as it was
     precision = np.diag(layout.precision()) + colours.information() + silhouettes.information()
-    spread = np.sqrt(np.diag(np.linalg.inv(precision)))
+    spread = np.sqrt(np.diag(np.linalg.inv(precision)).clip(0))
     result = {
         name: width * spread[layout.first[name] :][: getattr(calibration, name).numel()]
         .reshape(getattr(calibration, name).shape)

@@ -83,12 +83,12 @@ class Patches:
     def seen(self, photographs: Photographs) -> np.ndarray:
         """Find the patch (n, H, W) that each pixel of n photographs shows. Beside the object it is the nearest one.
 
-        It is -1 in photographs without the object.
+        In photographs without the object it is 0.
         """
         own = photographs.in_units(self.surface.unit)
         hits = [find_triangles(self.surface.scene, self.surface.shape, own, 1, 0, pixels) for pixels in own.chunks(1)]
         shown, triangle = (np.concatenate([np.array(hit[k]) for hit in hits]).reshape(own.shape) for k in range(2))
-        patches = np.full(own.shape, -1)
+        patches = np.zeros(own.shape, int)
         patches[shown] = self.of_vertex[self.surface.faces[triangle[shown], 0]]
         for n, inside in enumerate(shown):
             if inside.any():
