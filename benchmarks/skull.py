@@ -108,12 +108,15 @@ def masks_off(capture: Path) -> str:
 def neighbours(result: Path) -> str:
     """How much photographs from almost the same place differ in brightness, and how much with their powers taken out.
 
-    Brightness is the median of log radiance at pixels of the mask that are not clipped, times the squared distance.
+    Brightness is the median of log radiance at pixels of the mask that are not clipped, times the squared distance. All
+    photographs have the same exposure.
     """
     capture = load_capture(result / "scene.xml")
-    powers = json.loads((result / "calibration.json").read_text())["photographs"]
+    photographs = json.loads((result / "calibration.json").read_text())["photographs"]
     center, _ = capture.sphere()
-    chosen = [k for k, name in enumerate(capture.names) if "power" in powers.get(name, {})]
+    chosen = [k for k, name in enumerate(capture.names) if "power" in photographs.get(name, {})]
+    if not chosen:
+        return "no powers were refined"
     from_center = np.array([capture.shots[k].camera.position - center for k in chosen])
     distances = np.linalg.norm(from_center, axis=1)
     directions = from_center / distances[:, None]
@@ -122,7 +125,7 @@ def neighbours(result: Path) -> str:
         seen = capture.observe([k], 8)
         inside = (seen.mask > 0.99) & ~seen.clipped.any(-1) & (seen.rgb > 0).all(-1)
         levels.append(seen.rgb[inside].log().median(0).values.numpy() + 2 * np.log(distance))
-    found = np.log([powers[capture.names[k]]["power"] for k in chosen])
+    found = np.log([photographs[capture.names[k]]["power"] for k in chosen])
     a, b = np.array([*itertools.combinations(range(len(chosen)), 2)]).T
     near = (directions[a] * directions[b]).sum(1) > NEAR[0]
     near &= np.abs(np.log(distances[a] / distances[b])) < NEAR[1]
@@ -152,7 +155,8 @@ def main() -> None:
     result = capture / f"fit_{options.preset}"
     run("mi_ring.fit", capture / "scene.xml", "--preset", options.preset, "--holdout", EVERY, "--out", result,
         *options.fit)  # fmt: skip
-    print(neighbours(result), flush=True)
+    if (result / "calibration.json").exists():
+        print(neighbours(result), flush=True)
     run("mi_ring.render", result, held_out(capture, result), result / "held_out")
     if REFERENCE.is_dir():
         photographs = capture / "reference"

@@ -211,8 +211,11 @@ def test_without_anything_seen_the_room_is_as_given():
     torch.testing.assert_close(room.harmonics, given)
 
 
-def solved_room(*shares):
-    """Light of the room that least squares finds, and the true one, in photographs of which it is these shares."""
+def solved_room(*shares, given=None):
+    """Light of the room that least squares finds, and the true one, in photographs of which it is these shares.
+
+    They are beside the room that is given.
+    """
     random = torch.Generator().manual_seed(0)
     harmonics = torch.rand(len(ALL), 1, 5, 7, 1, generator=random).expand(-1, -1, -1, -1, 3)
     around = GlobalIllumination(torch.zeros(1, 5, 7, 3), ALL, harmonics, harmonics, torch.ones(1, 5, 7),
@@ -222,7 +225,7 @@ def solved_room(*shares):
     light = torch.einsum("jnhwc,jc->nhwc", harmonics, truth[ALL])
     truth *= torch.tensor(shares) / light.mean()
     missing = (light * torch.tensor(shares) / light.mean()).repeat_interleave(2, 1).repeat_interleave(2, 2)
-    room = RoomLight(torch.zeros(BASIS, 3), 0.3)
+    room = RoomLight(torch.zeros(BASIS, 3) if given is None else given, 0.3)
     room.solve(around, torch.ones(1, 10, 14, 3), 1 + missing, torch.ones(1, 10, 14) > 0)
     found, missing = (torch.einsum("jnhwc,jc->nhwc", harmonics, part[ALL]) for part in (room.harmonics, truth))
     return room, found, missing
@@ -248,6 +251,10 @@ def test_a_room_is_believed_by_its_share_and_by_its_colours():
     assert found.mean() > 0.95 * missing.mean()
     _, tinted, missing = solved_room(0.3, 0.25, 0.15)
     assert tinted.mean() > 0.9 * missing.mean()
+    given = torch.zeros(BASIS, 3)
+    given[0] = 0.5
+    dimmer, *_ = solved_room(-0.1, -0.1, -0.1, given=given)
+    assert (dimmer.harmonics[0] < given[0]).all()  # what a scene file tells may be less
     for shares in (0.01, 0.015, 0.02), (-0.1, -0.05, 0.15), (-0.1, -0.1, -0.1):
         assert not solved_room(*shares)[0].harmonics.any()
 

@@ -41,8 +41,8 @@ class RoomLight(nn.Module):
         """
         super().__init__()
         self.exposure, self.frames, self.alone = exposure, tuple(frames), alone
-        free = harmonics_up_to(MAX_ORDER if alone else BESIDE_FLASH, frames)
-        self.which = sorted({*free, *given.abs().sum(1).nonzero()[:, 0].tolist()})
+        self.free = harmonics_up_to(MAX_ORDER if alone else BESIDE_FLASH, frames)  #: those that are estimated
+        self.which = sorted({*self.free, *given.abs().sum(1).nonzero()[:, 0].tolist()})
         self.register_buffer("given", given, persistent=False)
         self.register_buffer("harmonics", given.clone())
         self.register_buffer("matrix", torch.zeros(3, BASIS, BASIS))
@@ -94,7 +94,7 @@ class RoomLight(nn.Module):
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
         shown = torch.einsum("jnc,nc,n->cj", torch.cat([basis, seen[None]]), seen, weight)
         equations = total(torch.cat([matrix, vector[..., None], shown[:, :-1, None]], -1))
-        brightness = total(shown[:, -1])
+        brightness = total(shown[:, -1])  # finite if the others are
         if not bool(equations.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
             return
         self.matrix *= MEMORY
@@ -107,27 +107,32 @@ class RoomLight(nn.Module):
         told = self.matrix.diagonal(dim1=1, dim2=2)[:, which].mean(1)
         ridge = RIDGE * told[:, None, None] * torch.eye(BASIS).to(self.matrix)
         if bool((ridge.amax((1, 2)) > 0).all()):
-            free = harmonics_up_to(MAX_ORDER if self.alone and progress >= FINE else BESIDE_FLASH, self.frames)
+            free = self.free if progress >= FINE else harmonics_up_to(BESIDE_FLASH, self.frames)
             right = self.vector[..., None] - self.matrix @ self.given.T[..., None]
             more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
             self.harmonics = self.given.clone()
-            self.harmonics[free] += more.T if self.alone else self.believed(more, free) * more.T
+            self.harmonics[free] += self.believed(more, free) * more.T
             # A room with negative mean radiance is impossible: another part of the model is too bright then.
             self.harmonics[:, self.harmonics[0] < 0] = 0.0
 
     def believed(self, more: Tensor, free: list[int]) -> float:
         """Return the factor, 0 to 1, of room light that is believed. `more` (3, J): of the harmonics `free`, as solved.
 
-        It depends on the mean share of this light in the photographs and on its error: colours that differ tell how
-        large that is, but it is at least `DOUBT`. The form is that of "Estimation with quadratic loss" (James and Stein
-        1961).
+        It is 1 if there is no flash, and if the capture tells of a room. Otherwise it depends on the mean share of this
+        light in the photographs and on its error: colours that differ tell how large that is, but it is at least
+        `DOUBT`. The form is that of "Estimation with quadratic loss" (James and Stein 1961).
         """
+        if self.alone or self.given.any():
+            return 1.0
         shares = (more * self.shown[:, free]).sum(1) / self.shown[:, -1].clamp(min=1e-12)
         share, error = float(shares.mean()), float(shares.var() / 3) + DOUBT**2
         return max(0.0, 1 - error / share**2) if share > 0 else 0.0
 
     def doubted(self) -> Tensor:
-        """Return the first harmonic (3,) of a room alike from all sides, as faint as one that is not believed."""
-        if self.alone:
+        """Return the first harmonic (3,) [radiance] of a room as faint as one that is not believed.
+
+        It is 0 if every room is believed, and before photographs were seen.
+        """
+        if self.alone or self.given.any():
             return self.harmonics.new_zeros(3)
-        return DOUBT * self.shown[:, -1] / self.shown[:, 0].clamp(min=1e-12)
+        return torch.where(self.shown[:, 0] > 0, DOUBT * self.shown[:, -1] / self.shown[:, 0], 0.0)

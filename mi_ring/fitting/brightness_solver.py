@@ -23,7 +23,8 @@ LEAST_TILT = 0.1  #: and at least this
 DOUBT_OF_CONE, DOUBT_OF_CONTRAST = 0.05, 0.01
 RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
 #: Progress of the fit from which photographs are no longer compared. The flash's place follows the gradient of another
-#: measure of error, and changes brightness almost like a tilt: together they would drift without end.
+#: measure of error, and changes brightness almost like a tilt: together they would drift without end. A contrast would
+#: be lost bit by bit to the material. Steps go on toward the last solution.
 SETTLED = 0.5
 CONE, CONTRAST, SHOWN, AWAY = [0, 1, 2], [3], [4], [5]  #: numbers of the columns of `columns`
 

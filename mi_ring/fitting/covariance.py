@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.calibration.calibration import Calibration
+from mi_ring.calibration.unknowns import Exposure
 from mi_ring.fitting.local_unknowns import Patches
 from mi_ring.fitting.losses import perceived
 from mi_ring.fitting.model import Model
@@ -24,6 +25,7 @@ from mi_ring.rendering import prediction
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
+from mi_ring.scene.plain_mesh import POSITIONS
 
 COMPARED_WIDTH, SPP = 96, 8  #: of the compared pictures: largest width [px], samples per pixel
 ROOM, DIM = 10.0, 0.01  #: prior and step of the room's light [exposure]
@@ -39,15 +41,19 @@ class Layout:
         for name in calibration.widths:
             self.first[name] = self.count
             self.count += getattr(calibration, name).numel()
-        #: numbers of the room's harmonics that are unknown; R, G, B of each
-        self.room = calibration.room.which if "ambient" in calibration.refined else []
+        #: the room's harmonics that are unknown; R, G, B of each
+        self.room = calibration.room.free if "ambient" in calibration.refined else []
         self.first["ambient"] = self.count
         self.count += 3 * len(self.room)
 
-    def precision(self) -> np.ndarray:
-        """Return the precision of the prior of each parameter (N,)."""
-        result = np.ones(self.count)
-        result[self.first["ambient"] :] = 1 / (ROOM * self.calibration.rig.exposure) ** 2
+    def centring(self) -> np.ndarray:
+        """Return the matrix (N, N) that subtracts from powers and gains their means, as `Calibration` does."""
+        result, fitted = np.eye(self.count), self.calibration.rig.fitted.numpy()
+        for name, unknown in self.calibration.unknowns.items():
+            if isinstance(unknown, Exposure):
+                for colour in range(3):
+                    at = self.first[name] + 3 * fitted + colour
+                    result[np.ix_(at, at)] -= 1 / len(at)
         return result
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
@@ -68,15 +74,14 @@ class Layout:
 def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
     """Compute the standard deviation of each refined unknown of calibration.
 
-    Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown; {} if there are none. The
-    room's light is "ambient": (3,), the deviations of the first harmonic's R, G, B. All fitted photographs are
-    rendered. `level`: level of the rendered mesh.
+    Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown. The room's light is
+    "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. All fitted photographs are rendered.
+    `level`: level of the rendered mesh. Colours and silhouettes eliminate the surface each by themselves, which counts
+    its prior twice.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None
     layout = Layout(calibration)
-    if not layout.count:
-        return {}
     surface = renderer.show(model, level)
     patches = Patches(surface, ring.domain.sample(level)[0], float(ring.radius), ring.brdf_net.bsdf_parameters)
     colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))
@@ -85,15 +90,16 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
         group = CovarianceGroup(problem, calibration, surface, patches, ring.indirect, index, scale)
         compare(group, layout, colours, silhouettes)
     calibration.relight(surface)  # as it was
-    precision = np.diag(layout.precision()) + colours.information() + silhouettes.information()
-    spread = np.sqrt(np.diag(np.linalg.inv(precision)).clip(0))
+    precision = np.eye(layout.count) + colours.information() + silhouettes.information()
+    centring = layout.centring()
+    spread = np.sqrt(np.diag(centring @ np.linalg.inv(precision) @ centring.T))
     result = {
         name: width * spread[layout.first[name] :][: getattr(calibration, name).numel()]
         .reshape(getattr(calibration, name).shape)
         for name, width in calibration.widths.items()
     }  # fmt: skip
     if layout.room:
-        result["ambient"] = spread[layout.first["ambient"] :][:3]
+        result["ambient"] = ROOM * problem.exposure * spread[layout.first["ambient"] :][:3]
     return result
 
 
@@ -103,31 +109,30 @@ class Equations:
     Photographs are added one by one. Each of the `patches` of the surface has L more unknowns of its own.
     """
 
-    def __init__(self, count: int, patches: int = 0, of_each: int = 0) -> None:
+    def __init__(self, count: int, patches: int, of_each: int) -> None:
         self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
         self.own = np.zeros((patches, of_each, of_each))  #: products of a patch's unknowns
-        self.cross = np.zeros((patches, of_each, count), np.float32)  #: and of these with the parameters
+        self.cross = np.zeros((patches, of_each, count))  #: and of these with the parameters
 
     def add(
-        self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray, local: Tensor | None = None,
-        patch: np.ndarray | None = None,
-    ) -> None:  # fmt: skip
-        """Add one photograph to the equations.
+        self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray, local: Tensor, patch: np.ndarray
+    ) -> None:
+        """Add one photograph to the equations. Pixels of which a number is not finite are left out.
 
         `slopes` (K, H, W, C): derivatives of the prediction with respect to K parameters. `places` (K,): their indices
         among all N parameters. `error` (H, W, C): prediction minus photograph. `counted` (H, W) bool: True for pixels
         to use. `local` (L, H, W, C): derivatives with respect to the unknowns of the patch (H, W) of each pixel.
         """
-        slopes = slopes[:, counted].double()
+        counted = counted & torch.cat([slopes, local, error[None]]).isfinite().all(-1).all(0)
+        if not counted.any():
+            return
+        slopes, own, at = slopes[:, counted].double(), local[:, counted].double(), patch[counted.numpy()]
         flat = slopes.flatten(1)
         np.add.at(self.matrix, np.ix_(places, places), (flat @ flat.T).numpy())
-        if local is not None and patch is not None:
-            own, at = local[:, counted].double(), patch[counted.numpy()]
-            summed = csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (len(self.own), len(at)))
-            products = [torch.einsum("apc,bpc->pab", own, other).numpy() for other in (own, slopes)]
-            alone, together = ((summed @ part.reshape(len(at), -1)).reshape(-1, *part.shape[1:]) for part in products)
-            self.own += alone
-            self.cross[:, :, places] += together
+        summed = csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (len(self.own), len(at)))
+        products = [torch.einsum("apc,bpc->pab", own, other).flatten(1).numpy() for other in (own, slopes)]
+        self.own += (summed @ products[0]).reshape(self.own.shape)
+        self.cross[:, :, places] += (summed @ products[1]).reshape(*self.own.shape[:2], len(places))
         height, width, channels = error.shape
         error = torch.where(counted[..., None], error, 0.0).double()
         error = F.pad(error, (0, 0, 0, -width % BLOCK, 0, -height % BLOCK))
@@ -188,7 +193,7 @@ class CovarianceGroup:
         """Render interreflection and room light. Returns both as linear radiance (n, H, W, 3), and the transfer.
 
         Light that the fit does not use is 0. `lit` (n, H, W, 3): direct light. `coverage` (n, H, W): the object's share
-        of each pixel. The transfer (J, n, H, W, 3) is radiance in a room of one harmonic, of those that are unknown.
+        of each pixel. The transfer (J, n, H, W, 3) is radiance in a room of one harmonic, of J that are unknown.
         """
         calibration, indirect = self.calibration, self.indirect
         bounced, room_light, transfer = torch.zeros_like(lit), torch.zeros_like(lit), lit.new_zeros(0, *lit.shape)
@@ -201,14 +206,17 @@ class CovarianceGroup:
             added = around.occlusion if photographs.dark else around.room_light
             room_light = added(room.to(self.problem.device)).cpu() if room.any() else room_light
             if unknown:
-                transfer = torch.stack([around.upsampled(one).cpu() for one in around.transfer])
+                chosen = [around.harmonics.index(k) for k in calibration.room.free]
+                transfer = torch.stack([around.upsampled(around.transfer[k]).cpu() for k in chosen])
         return bounced, room_light, transfer
 
     def local_slopes(self, picture: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
         """Return derivatives with respect to the unknowns of each pixel's patch: (L, n, H, W, 3), and (1, n, H, W).
 
-        The first are of `picture`, a function of direct light, the second of the coverage: it depends on the last.
+        The first are of `picture`, a function of direct light. The second are of the coverage, with respect to the
+        displacement.
         """
+        moving = torch.zeros(0)
         slopes: list[Tensor] = []
         for unknown in self.patches.unknowns:
             sides: list[tuple[Tensor, Tensor]] = []
@@ -216,7 +224,8 @@ class CovarianceGroup:
                 with self.patches.changed(unknown, step):
                     lit, coverage = self.direct()
                 sides.append((picture(lit), coverage))
-            slope, moving = ((plus - minus) / (2 * STEP) for plus, minus in zip(*sides))
+            slope, covering = ((plus - minus) / (2 * STEP) for plus, minus in zip(*sides))
+            moving = covering if unknown.name == POSITIONS else moving
             slopes += [slope * channel for channel in torch.eye(3)] if unknown.channels == 3 else [slope]
         return torch.stack(slopes), moving[None]
 
@@ -261,7 +270,7 @@ def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes
         slopes.append([(plus - minus) / (2 * STEP) for plus, minus in zip(*sides)])
     for harmonic in transfer:
         plus, minus = (picture(lit + sign * DIM * problem.exposure * harmonic) for sign in (1, -1))
-        slope = (plus - minus) / (2 * DIM * problem.exposure)
+        slope = (plus - minus) * ROOM / (2 * DIM)
         slopes += [[slope * channel, torch.zeros_like(coverage)] for channel in torch.eye(3)]
     changing, covering = (torch.stack(part) for part in zip(*slopes))
     room = layout.first["ambient"] + np.arange(3 * len(transfer))

@@ -18,9 +18,10 @@ from mi_ring.nets.brdf_net import Parameter
 from mi_ring.rendering.image_formation import find_triangles
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
+from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.plain_mesh import NORMALS, POSITIONS
 
-PATCH = 0.1  #: side of the cubes that divide the domain into patches
+PATCH = 0.1  #: side of the cubes that divide the domain into patches [radius]
 FACTOR, SHARE = 1.0, 0.3  #: priors of the material: logarithm of a parameter without limit, or share of its range
 TILT, OFFSET = 0.3, 0.02  #: priors of the surface: tilt of the normals [rad], displacement along them [radius]
 
@@ -30,15 +31,17 @@ class LocalUnknown(NamedTuple):
 
     name: str  #: the parameter of the mesh that it changes
     width: float  #: standard deviation of the prior
-    axis: int = 0  #: about which normals are tilted
     channels: int = 1  #: of a colour: each is an unknown
-    is_factor: bool = False  #: Is it the logarithm of a factor?
+    axis: int = 0  #: about which normals are tilted
+    low: float = -np.inf  #: least and greatest value of a parameter of the material. One without limit is changed by a
+    high: float = np.inf  #: factor, of which the unknown is the logarithm
 
 
 class Patches:
     """The patches of a surface that is shown, and their unknowns.
 
-    They are the parameters of the BSDF, two tilts of the normals, and a displacement along the normals.
+    They are the parameters of the BSDF, two tilts of the normals (except of flat triangles), and a displacement along
+    the normals.
     """
 
     def __init__(self, surface: Surface, s: Tensor, radius: float, material: Sequence[Parameter]) -> None:
@@ -51,17 +54,16 @@ class Patches:
         self.of_vertex = numbers.numpy()  #: (V,) number of the patch
         self.count = int(self.of_vertex.max()) + 1
         self.unknowns = [
-            LocalUnknown(f"vertex_{p.name}", FACTOR if np.isinf(p.high) else SHARE * (p.high - p.low),
-                         channels=p.channels, is_factor=bool(np.isinf(p.high))) for p in material
+            LocalUnknown(f"vertex_{p.name}", FACTOR if np.isinf(p.high) else SHARE * (p.high - p.low), p.channels,
+                         low=p.low, high=p.high) for p in material
         ]  # fmt: skip
-        if surface.prefix + NORMALS in surface.params:  # else the triangles are flat
-            self.unknowns += [LocalUnknown(NORMALS, TILT, axis) for axis in range(2)]
-            self.unknowns.append(LocalUnknown(POSITIONS, OFFSET * radius / surface.unit))
+        if not surface.shape.has_face_normals():
+            self.unknowns += [LocalUnknown(NORMALS, TILT, axis=axis) for axis in range(2)]
+        self.unknowns.append(LocalUnknown(POSITIONS, OFFSET * radius / surface.unit))
         self.components = sum(unknown.channels for unknown in self.unknowns)  #: number of unknowns of a patch
-        names = {unknown.name for unknown in self.unknowns}
+        names = {unknown.name for unknown in self.unknowns} | {NORMALS}
         self.values = {name: np.array(surface.params[surface.prefix + name]) for name in names}
-        if NORMALS in names:
-            self.axes = axes_of(self.values[NORMALS].reshape(-1, 3), self.of_vertex, self.count)
+        self.axes = axes_of(self.values[NORMALS].reshape(-1, 3), self.of_vertex, self.count)
 
     @contextmanager
     def changed(self, unknown: LocalUnknown, step: float) -> Iterator[None]:
@@ -73,12 +75,13 @@ class Patches:
         elif unknown.name == POSITIONS:
             now = value + step * self.values[NORMALS]
         else:
-            now = value * np.exp(step) if unknown.is_factor else value + step
+            low, high = unknown.low, unknown.high
+            now = low + (value - low) * np.exp(step) if np.isinf(high) else (value + step).clip(low, high)
         try:
-            self.surface.write_arrays({unknown.name: mi.Float(now.astype(np.float32))})
+            self.surface.write_arrays({unknown.name: to_flat(mi.Float, now)})
             yield
         finally:
-            self.surface.write_arrays({unknown.name: mi.Float(value)})
+            self.surface.write_arrays({unknown.name: to_flat(mi.Float, value)})
 
     def seen(self, photographs: Photographs) -> np.ndarray:
         """Find the patch (n, H, W) that each pixel of n photographs shows. Beside the object it is the nearest one.
@@ -98,7 +101,7 @@ class Patches:
 
 
 def axes_of(normals: np.ndarray, patch: np.ndarray, count: int) -> np.ndarray:
-    """Return two unit vectors (2, V, 3) along the surface at each vertex. A patch has two, about orthogonal to normals.
+    """Return two unit vectors (2, V, 3) along the surface at each vertex, of about the same directions in a patch.
 
     `normals` (V, 3). `patch` (V,): number of the patch of each vertex, below `count`.
     """
@@ -106,6 +109,6 @@ def axes_of(normals: np.ndarray, patch: np.ndarray, count: int) -> np.ndarray:
     def unit(vectors: np.ndarray) -> np.ndarray:
         return vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(1e-9)
 
-    mean = unit(np.stack([np.bincount(patch, part, count) for part in normals.T], 1))
-    one = unit(np.cross(mean, np.eye(3)[np.abs(mean).argmin(1)]))
-    return np.stack([one, np.cross(mean, one)])[:, patch]
+    sizes = np.stack([np.bincount(patch, np.square(part), count) for part in normals.T], 1)
+    one = unit(np.cross(normals, np.eye(3)[sizes.argmin(1)][patch]))
+    return np.stack([one, np.cross(normals, one)])

@@ -52,9 +52,7 @@ def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
         moved = np.linalg.norm(np.subtract(entry["after"], entry["before"]).reshape(several), axis=1)
         spread = np.linalg.norm(np.reshape(entry["std"], several), axis=1)
         return entry["what"], "", f"by {np.median(moved):.3g}, at most {moved.max():.3g}", f"{np.median(spread):.2g}"
-    before, after, std = (
-        numbers(entry[key], digits) if key in entry else "" for key, digits in (("before", 4), ("after", 4), ("std", 2))
-    )
+    before, after, std = (numbers(entry[key], digits) for key, digits in (("before", 4), ("after", 4), ("std", 2)))
     return entry["what"], before, after, std
 
 
