@@ -22,10 +22,10 @@ LEAST_TILT = 0.1  #: and at least this
 #: wrong material, may explain as much.
 DOUBT_OF_CONE, DOUBT_OF_CONTRAST = 0.05, 0.01
 RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
-#: Progress of the fit from which photographs are no longer compared. The flash's place follows the gradient of another
+#: Largest number of iterations in which photographs are compared. The flash's place follows the gradient of another
 #: measure of error, and changes brightness almost like a tilt: together they would drift without end. A contrast would
 #: be lost bit by bit to the material. Steps go on toward the last solution.
-SETTLED = 0.5
+LOOKS = 80
 CONE, CONTRAST, SHOWN, AWAY = [0, 1, 2], [3], [4], [5]  #: numbers of the columns of `columns`
 
 
@@ -41,7 +41,8 @@ class BrightnessSolver(torch.optim.Optimizer):
         super().__init__([{"params": [calibration.get_parameter(name) for name in names]}], {"lr": self.rate.initial})
         self.first = self.param_groups[0]["params"][0]
         #: of each photograph, when it was last seen: the products of the six columns and the error
-        self.state[self.first] = {"moments": torch.zeros(len(calibration.rig), 7, 7)}
+        #: and the number of iterations in which photographs were compared
+        self.state[self.first] = {"moments": torch.zeros(len(calibration.rig), 7, 7), "looks": torch.zeros(())}
 
     @property
     def moments(self) -> Tensor:
@@ -60,8 +61,10 @@ class BrightnessSolver(torch.optim.Optimizer):
 
         Only differences within a photograph and colour count, so its exposure does not matter.
         """
-        if not START <= it.progress < SETTLED:
+        looks = self.state[self.first]["looks"]
+        if it.progress < START or looks >= LOOKS:
             return
+        looks += 1
         index, rig = it.batch.photographs, self.calibration.rig
         directions = self.calibration.directions(index, it.batch.scale)
         pixels = (it.object_pixels() & ~it.observation.clipped.any(-1)).cpu()
