@@ -76,8 +76,8 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
     Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown. The room's light is
     "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. All fitted photographs are rendered.
-    `level`: level of the rendered mesh. Colours and silhouettes eliminate the surface each by themselves, which counts
-    its prior twice.
+    `level`: level of the rendered mesh. Colours and silhouettes eliminate the surface separately, so its prior counts
+    twice.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None
