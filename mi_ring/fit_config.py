@@ -11,7 +11,8 @@ import tyro
 from tyro.conf import Positional, Suppress, arg
 
 from mi_ring.errors import InputError, require_range
-from mi_ring.fitting.config import PRESETS, WEIGHTS, Ablation, Common, Config, Tuning, as_typed
+from mi_ring.fitting.config import PRESETS, WEIGHTS, Ablation, Common, Config, Tuning
+from mi_ring.fitting.setting_types import as_typed
 from mi_ring.output import results
 from mi_ring.system import command
 

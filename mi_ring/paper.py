@@ -13,7 +13,7 @@ from mi_ring.experiments.catalogue import EXPERIMENTS
 from mi_ring.experiments.engine import run_experiment
 from mi_ring.experiments.experiment import ExperimentOptions
 from mi_ring.fit_config import MOST_THREADS
-from mi_ring.fitting.config import as_typed
+from mi_ring.fitting.setting_types import as_typed
 from mi_ring.system import command
 from mi_ring.system.files import locked
 from mi_ring.system.machine import set_variant
