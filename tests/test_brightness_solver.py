@@ -9,7 +9,7 @@ from helpers.quick_fits import posed
 
 from mi_ring.calibration.camera_response import contrast_slope
 from mi_ring.capture.observation import Observation
-from mi_ring.fitting.brightness_solver import BrightnessSolver, least_squares
+from mi_ring.fitting.brightness_solver import BrightnessSolver, flash_slope, least_squares
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.processes import ALONE
 from mi_ring.fitting.schedule import Stage
@@ -35,13 +35,30 @@ def rays(fit):
     return torch.from_numpy(np.stack(result)).float().view(len(INDEX), height, width, 3)
 
 
-def discs(fit, apart):
-    """Squared distances (12, H, W) from the middle of a round object, which is not in the middle of photographs.
+def places(fit, apart):
+    """Places (12, H, W, 2) of pixels beside the middle of a round object, which is not in the middle of photographs.
 
     In radii of the object. `apart`: its largest distance from the optical axis.
     """
     middles = apart * torch.rand(len(INDEX), 1, 1, 2, generator=torch.Generator().manual_seed(2)) - apart / 2
-    return ((rays(fit)[..., :2] - middles) / 0.15).square().sum(-1)
+    return (rays(fit)[..., :2] - middles) / 0.15
+
+
+def discs(fit, apart):
+    """Squared distances (12, H, W) from the middle of that object, in its radii."""
+    return places(fit, apart).square().sum(-1)
+
+
+def balls(fit, apart):
+    """Normals (12, H, W, 3) of that object as a ball, in the axes of the cameras."""
+    sides = places(fit, apart)
+    return torch.cat([sides, -(1 - sides.square().sum(-1, keepdim=True)).clamp(min=0.04).sqrt()], -1)
+
+
+def matte(fit, normals, left=0.0, up=0.0):
+    """Brightness (12, H, W) of matte points in the distance of the object, under a flash beside the camera."""
+    v = torch.tensor([left, up, 0.0]) - rays(fit)
+    return (normals * v).sum(-1).clamp(min=0.05) / v.norm(dim=-1) ** 3
 
 
 def solved(fit, picture, photographed, inside, rounds=40, noise=0.1, looks=0):
@@ -63,10 +80,17 @@ def solved(fit, picture, photographed, inside, rounds=40, noise=0.1, looks=0):
         clipped = torch.zeros(*picture.shape, 3, dtype=torch.bool)
         seen = Observation((photographed * error)[..., None].expand(-1, -1, -1, 3), clipped, inside,
                            torch.ones(len(INDEX)).bool(), None)  # fmt: skip
-        prediction = SimpleNamespace(rgb=shown[..., None].expand(-1, -1, -1, 3), coverage=inside)
+        prediction = SimpleNamespace(rgb=shown[..., None].expand(-1, -1, -1, 3), coverage=inside,
+                                     normals=lambda: in_world(fit, balls(fit, 0.4)))  # fmt: skip
         solver.look(Iteration(batch, seen, prediction, fit.context()))
         solver.step()
     return solver.numbers().numpy()
+
+
+def in_world(fit, vectors):
+    """Turn vectors (12, H, W, 3) from the cameras' axes to those of the world."""
+    cameras = torch.from_numpy(np.stack([fit.capture.shots[k].camera.to_world for k in INDEX])).float()
+    return torch.einsum("nij,nhwj->nhwi", cameras[:, :3, :3], vectors)
 
 
 def texture(fit):
@@ -82,6 +106,28 @@ def test_a_cone_is_found_whatever_each_photographs_exposure(fit, cone):
     photographed = exposures * texture(fit) * cosine**exponent * (left * x + up * y).exp()
     found = solved(fit, texture(fit), photographed, discs(fit, 0.4) < 1, noise=0.02)
     np.testing.assert_allclose(found, [*cone, 0], rtol=0.05, atol=0.2)
+
+
+def test_a_cone_is_found_beside_a_flash_whose_place_is_wrong(small_capture):
+    """By a tenth of the distance. If the place counted as known, the tilt would be wrong by more than two."""
+    fit, _ = posed(small_capture, refine=("falloff", "light"))
+    fit.model.calibration.rig.flash.zero_()
+    normals, (x, y, cosine) = balls(fit, 0.4), rays(fit).unbind(-1)
+    assumed, lit = (texture(fit) * matte(fit, normals, *place) for place in ((0.0, 0.0), (0.08, -0.06)))
+    photographed = lit * cosine**12.0 * (0.9 * x - 1.4 * y).exp()
+    found = solved(fit, assumed, photographed, discs(fit, 0.4) < 0.9, noise=0.02)
+    np.testing.assert_allclose(found, [12, 0.9, -1.4, 0], rtol=0.05, atol=0.3)
+
+
+def test_slope_by_the_flashs_place_is_that_of_matte_brightness(fit):
+    """By finite differences, in points with normals of all sides."""
+    fit.model.calibration.rig.flash.zero_()
+    normals = torch.nn.functional.normalize(balls(fit, 0.4) + torch.tensor([0.3, -0.2, -0.4]), dim=-1)
+    found = flash_slope(fit.model.calibration, INDEX, rays(fit), in_world(fit, normals))
+    lit = -(normals * rays(fit)).sum(-1) > 0.25
+    for k, step in enumerate(([0.01, 0.0], [0.0, 0.01])):
+        low, high = (matte(fit, normals, *(sign * s for s in step)).log() for sign in (-1, 1))
+        torch.testing.assert_close(found[..., k][lit], ((high - low) / 0.02)[lit], rtol=2e-3, atol=2e-3)
 
 
 def test_photographs_are_compared_in_no_more_than_eighty_iterations(fit):

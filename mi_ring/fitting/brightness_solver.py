@@ -3,8 +3,12 @@
 The logarithm of brightness is linear in the numbers of the cone, exponent and tilt, and almost linear in the logarithm
 of the contrast. So least squares determine them. Adam is too slow: a narrow flash has an exponent of 40, one without a
 cone 0.
+
+A flash that moves to one side changes brightness almost like a tilt. So if its place is refined, the least squares
+contain it as well. Adam finds the place; without its columns, place and tilt would follow each other without end.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,11 +26,12 @@ LEAST_TILT = 0.1  #: and at least this
 #: wrong material, may explain as much.
 DOUBT_OF_CONE, DOUBT_OF_CONTRAST = 0.05, 0.01
 RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
-#: Largest number of iterations in which photographs are compared. The flash's place follows the gradient of another
-#: measure of error, and changes brightness almost like a tilt: together they would drift without end. A contrast would
-#: be lost bit by bit to the material. Steps go on toward the last solution.
+#: Largest number of iterations in which photographs are compared. Later a contrast would be lost bit by bit to the
+#: material. Steps go on toward the last solution.
 LOOKS = 80
-CONE, CONTRAST, SHOWN, AWAY = [0, 1, 2], [3], [4], [5]  #: numbers of the columns of `columns`
+GRAZING = 0.2  #: cosine between normal and light below which the change of brightness no longer grows
+COLUMNS = 8  #: of `columns`
+CONE, CONTRAST, SHOWN, AWAY, PLACE = [0, 1, 2], [3], [4], [5], [6, 7]  #: numbers of them
 
 
 class BrightnessSolver(torch.optim.Optimizer):
@@ -40,13 +45,16 @@ class BrightnessSolver(torch.optim.Optimizer):
         names = [name for name in ("falloff", "tilt", "contrast") if name in calibration.unknowns]
         super().__init__([{"params": [calibration.get_parameter(name) for name in names]}], {"lr": self.rate.initial})
         self.first = self.param_groups[0]["params"][0]
-        #: of each photograph, when it was last seen: the products of the six columns and the error
+        #: of each photograph, when it was last seen: the products of the columns and the error;
         #: and the number of iterations in which photographs were compared
-        self.state[self.first] = {"moments": torch.zeros(len(calibration.rig), 7, 7), "looks": torch.zeros(())}
+        self.state[self.first] = {
+            "moments": torch.zeros(len(calibration.rig), COLUMNS + 1, COLUMNS + 1),
+            "looks": torch.zeros(()),
+        }
 
     @property
     def moments(self) -> Tensor:
-        """(P, 7, 7): sums over colours of mean products of the `columns` and, last, the error. 0: not seen yet."""
+        """(P, 9, 9): sums over colours of mean products of the `columns` and, last, the error. 0: not seen yet."""
         return self.state[self.first]["moments"]
 
     def numbers(self) -> Tensor:
@@ -70,8 +78,9 @@ class BrightnessSolver(torch.optim.Optimizer):
         pixels = (it.object_pixels() & ~it.observation.clipped.any(-1)).cpu()
         observed, predicted = it.observation.rgb.cpu(), it.prediction.rgb.cpu()
         slopes = contrast_slope(predicted, rig.response, index, directions[..., 2:])
+        sideways = flash_slope(self.calibration, index, directions, it.prediction.normals().cpu())
         bright = torch.minimum(observed, predicted) > BLACK * it.context.exposure
-        found = torch.zeros(len(index), 7, 7)
+        found = torch.zeros(len(index), COLUMNS + 1, COLUMNS + 1)
         for n, inside in enumerate(pixels):
             for colour in range(3):
                 chosen = inside & bright[n, ..., colour]
@@ -79,7 +88,9 @@ class BrightnessSolver(torch.optim.Optimizer):
                     continue
                 seen, shown = (light[n, ..., colour][chosen].log() for light in (observed, predicted))
                 turn = rig.held[index[n], :2, :2]
-                features = columns(directions[n][chosen], turn, slopes[n, ..., colour][chosen], shown)
+                features = columns(
+                    directions[n][chosen], sideways[n][chosen], turn, slopes[n, ..., colour][chosen], shown
+                )
                 error = ((seen - shown) - (seen - shown).mean()).clamp(-MOST, MOST)
                 # Plus what the prediction has already, so that the solution is the whole cone and contrast.
                 error = error - error.mean() + features[:, CONE + CONTRAST] @ self.numbers()
@@ -102,7 +113,8 @@ class BrightnessSolver(torch.optim.Optimizer):
             given = float(rig.views.cone[:, 0].mean())
             aimed = 0.0 if rig.turned else max(AIMED * abs(given + float(now[0])), LEAST_TILT)
             widths = torch.tensor([calibration.widths["falloff"], aimed, aimed])
-            cone = estimate(known, CONE, CONTRAST + SHOWN + AWAY, widths, DOUBT_OF_CONE)
+            others = CONTRAST + SHOWN + AWAY + (PLACE if "light" in calibration.unknowns else [])
+            cone = estimate(known, CONE, others, widths, DOUBT_OF_CONE)
             cone[0] = cone[0].clamp(min=-given)  # no flash is brighter at its sides
             change = rate * (cone - now[:3])
             calibration.get_parameter("falloff").add_(change[0] / calibration.widths["falloff"])
@@ -115,20 +127,42 @@ class BrightnessSolver(torch.optim.Optimizer):
             calibration.get_parameter("contrast").add_(rate * (contrast[0] - now[3]) / width)
 
 
-def columns(directions: Tensor, held: Tensor, slopes: Tensor, shown: Tensor) -> Tensor:
-    """Make the columns (n, 6) that explain the errors of n pixels of a photograph, each with mean 0.
+def flash_slope(calibration: Calibration, index: np.ndarray, directions: Tensor, normals: Tensor) -> Tensor:
+    """Compute how the logarithm of a matte surface's brightness changes if its light moves to the left and up.
+
+    Returns (N, H, W, 2), for a move by the distance from camera to object. `index` (N,): of the photographs.
+    `directions` (N, H, W, 3): of the pixels' rays, in the camera's axes. `normals` (N, H, W, 3): in the axes of the
+    world. All points count as equally far as the object's centre.
+
+    The brightness is n · v / |v|³, with the vector v from the point to the light. Its derivative is
+    n / (n · v) − 3 v / |v|².
+    """
+    views, center = calibration(), calibration.rig.center
+    cameras = views.cameras[index].detach()
+    axes, distance = cameras[..., :3], (cameras[..., 3] - center).norm(dim=-1)
+    place = torch.einsum("nji,nj->ni", axes, views.places[index].detach() - cameras[..., 3])
+    v = (place / distance[:, None])[:, None, None] - directions
+    facing = torch.einsum("nji,nhwj->nhwi", axes, normals)
+    along = (facing * v).sum(-1, keepdim=True).clamp(min=GRAZING)
+    return (facing / along - 3 * v / v.square().sum(-1, keepdim=True))[..., :2]
+
+
+def columns(directions: Tensor, sideways: Tensor, held: Tensor, slopes: Tensor, shown: Tensor) -> Tensor:
+    """Make the columns (n, 8) that explain the errors of n pixels of a photograph, each with mean 0.
 
     The first three are those of the cone: logarithm of the cosine to the optical axis, directions to the left and up.
     The fourth is that of the contrast: `slopes` (n,), from `contrast_slope`. The others explain what looks like a cone:
-    `shown` (n,), the logarithm of predicted brightness, for an error of the exponent of the camera's curve; and the
-    square of the distance from the middle of the object, for rims that are too bright or too dark.
+    `shown` (n,), the logarithm of predicted brightness, for an error of the exponent of the camera's curve; the square
+    of the distance from the middle of the object, for rims that are too bright or too dark; and `sideways` (n, 2), from
+    `flash_slope`, for an error of the flash's place.
 
     `directions` (n, 3): of the pixels' rays in the camera's axes. `held` (2, 2): turns the axes of an upright camera
     into those of this one.
     """
     middle = directions[:, :2] - directions[:, :2].mean(0)
     away = middle.square().sum(1)
-    result = torch.column_stack([directions[:, 2].log(), directions[:, :2] @ held, slopes, shown, away / away.mean()])
+    cone = directions[:, 2].log(), directions[:, :2] @ held
+    result = torch.column_stack([*cone, slopes, shown, away / away.mean(), sideways @ held])
     return result - result.mean(0)
 
 

@@ -36,11 +36,19 @@ class Prediction:
     other_light: GlobalIllumination | None  #: interreflection and room light; None: not rendered
     averages: Averages  #: of interreflection, with these photographs; see `Renderer.remember`
     without_room: Tensor  #: (n, H, W, 3) linear radiance with the room's light as if nothing occluded it; detached
+    surface: Surface  #: that was rendered
 
     def detached(self) -> "Prediction":
         """Return a copy without gradients. It does not hold the autograd graph, which uses much memory."""
         return replace(self, vertices=self.vertices.detach(), rgb=self.rgb.detach(), coverage=self.coverage.detach(),
                        material={name: value.detach() for name, value in self.material.items()})  # fmt: skip
+
+    def normals(self) -> Tensor:
+        """Render the unit normals (n, H, W, 3) in the axes of the world. Pixels without a surface are 0.
+
+        Call it before the surface is written again, that is, in the same iteration.
+        """
+        return torch.from_numpy(prediction.maps(self.surface, self.photographs, ())["normal"])
 
 
 class Renderer:
@@ -97,7 +105,7 @@ class Renderer:
         if other and photographs.harmonics:
             linear = linear + other.occlusion(torch.from_numpy(photographs.room).to(linear))
         rgb = calibration.recorded(linear, batch.photographs, batch.scale) if calibration else linear
-        return Prediction(vertices, material, rgb, coverage, photographs, other, averages, without_room)
+        return Prediction(vertices, material, rgb, coverage, photographs, other, averages, without_room, self.surface)
 
     def deform(self, problem: Problem, ring: FittedObject, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Evaluate the networks at the domain points of a batch. Returns (vertices (V, 3), material).
