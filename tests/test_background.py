@@ -1,11 +1,11 @@
-"""The background tells whether the camera stood still while the object turned."""
+"""Whether photographs from several sides of the object have the same background."""
 
 import cv2
 import numpy as np
 import pytest
 
 import mi_ring
-from mi_ring.capture.background import stands_still
+from mi_ring.capture.background import background_moves
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.reduction import reduced
 from mi_ring.images import linear_to_srgb, to_bytes
@@ -59,8 +59,8 @@ def capture_of(small_capture):
     {}, {"noise": 0.02}, {"contrast": 0.08}, {"heights": 3}, {"table": 2.0}, {"corners": 1.5}, {"radius": 3},
 ], ids=str)  # fmt: skip
 @pytest.mark.parametrize("moves", [False, True])
-def test_a_background_that_moves_is_told_from_one_that_stands_still(moves, how, capture_of):
-    assert stands_still(capture_of(*photographs(moves, **how))) is not moves
+def test_a_background_that_moves_is_told_from_one_that_background_moves(moves, how, capture_of):
+    assert background_moves(capture_of(*photographs(moves, **how))) is moves
 
 
 @pytest.mark.parametrize("how", [
@@ -68,13 +68,13 @@ def test_a_background_that_moves_is_told_from_one_that_stands_still(moves, how, 
     {"contrast": 0, "table": 2.0, "noise": 0.003}, {"contrast": 0, "corners": 1.5, "noise": 0.003},
 ], ids=str)  # fmt: skip
 def test_a_black_or_plain_background_tells_nothing(how, capture_of):
-    assert not stands_still(capture_of(*photographs(False, **how)))
+    assert background_moves(capture_of(*photographs(False, **how))) is None
 
 
 def test_too_few_masks_or_masks_that_cover_all_tell_nothing(capture_of):
     images, masks = photographs(False)
-    assert not stands_still(capture_of(images, [*masks[:2], *[None] * (COUNT - 2)]))
-    assert not stands_still(capture_of(images, [np.full_like(mask, 255) for mask in masks]))
+    assert background_moves(capture_of(images, [*masks[:2], *[None] * (COUNT - 2)])) is None
+    assert background_moves(capture_of(images, [np.full_like(mask, 255) for mask in masks])) is None
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -87,7 +87,7 @@ def test_borders_of_undistorted_photographs_tell_nothing(moves, known, capture_o
     for image in images:
         image[corner] = 0
     valid = [~corner] * COUNT if known else None
-    assert stands_still(capture_of(images, masks, valid=valid)) is not moves
+    assert (background_moves(capture_of(images, masks, valid=valid)) is False) is not moves
 
 
 def test_a_plate_that_turns_with_the_object_may_move(capture_of):
@@ -95,7 +95,7 @@ def test_a_plate_that_turns_with_the_object_may_move(capture_of):
     plate = np.s_[45:60, 20:70]
     for image, other, mask in zip(images, others, masks):
         image[plate] = np.where(mask[plate][..., None] > 0, image[plate], other[plate])
-    assert stands_still(capture_of(images, masks))
+    assert background_moves(capture_of(images, masks)) is False
 
 
 def test_a_stand_that_looks_the_same_from_all_sides_does_not_stand_still(capture_of):
@@ -104,7 +104,7 @@ def test_a_stand_that_looks_the_same_from_all_sides_does_not_stand_still(capture
     for image, mask in zip(images, masks):
         stand = (rows > 50) & (abs(columns - 48) < 12) & (mask == 0)
         image[stand] = (image[stand] * 0.6).astype(np.uint8)
-    assert not stands_still(capture_of(images, masks))
+    assert background_moves(capture_of(images, masks)) is None
 
 
 def test_photographs_from_the_same_place_are_not_compared(small_capture):
@@ -116,7 +116,7 @@ def test_photographs_from_the_same_place_are_not_compared(small_capture):
     images = [images[k] if n % 2 else (images[k] * 0.8).astype(np.uint8) for n, k in enumerate(pairs)]
     masks = [masks[k] for k in pairs]
     capture = mi_ring.Capture.from_arrays(images, masks, cameras=cameras, center=[0, 0, 0], radius=1.0)
-    assert not stands_still(capture)
+    assert background_moves(capture)
 
 
 @pytest.mark.parametrize("moves", [False, True])
@@ -127,9 +127,9 @@ def test_photographs_that_are_cropped_to_the_object_are_read_whole(moves, captur
     for image in large[0]:
         image[~shown] = 255
     capture = capture_of(*large, valid=[shown] * COUNT)
-    assert not stands_still(reduced(capture, 64))  # there is no file to read again
+    assert background_moves(reduced(capture, 64)) is None  # there is no file to read again
     small = reduced(capture.save(tmp_path / "scene.xml"), 64)
     assert all(shot.window.share < 0.5 for shot in small.shots)
-    assert stands_still(small) is not moves
+    assert background_moves(small) is moves
     small.shots[0].files.filename.unlink()
-    assert not stands_still(small)
+    assert background_moves(small) is None

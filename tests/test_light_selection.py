@@ -92,25 +92,27 @@ def test_coarse_fits_decide(light, errors, believed, plain, small_capture, monke
     config, capture = mi_ring.Config.preset("fast", light=light), mi_ring.load_capture(small_capture)
     center, _ = capture.sphere()
     monkeypatch.setattr(light_selection, "Fit", Trial)
+    monkeypatch.setattr(light_selection, "object_turned", lambda capture: None)
     found = mi_ring.choose_lighting(capture, config)
     assert str(found) == believed and found.one_material_until == plain and found.lamps == ended[believed].lamps
     assert len(tried) == len(set(tried)) and set(tried) <= {*errors, "environment"}
 
 
-@pytest.mark.parametrize(("still", "own", "believed"), [
-    (True, 0.12, "turntable"), (True, 0.096, "capture"), (True, None, "turntable"), (False, 0.12, "environment"),
-    (False, None, "environment"),
+@pytest.mark.parametrize(("turned", "environment", "own", "believed"), [
+    (True, 0.082, 0.12, "turntable"), (True, 0.082, 0.096, "capture"), (True, 0.082, None, "turntable"),
+    (None, 0.082, 0.12, "environment"), (None, 0.082, None, "environment"), (None, 0.09, None, "turntable"),
+    (False, 0.09, None, "environment"),
 ])  # fmt: skip
-def test_a_background_that_stands_still_says_that_light_is_fixed_in_the_camera(
-    still, own, believed, small_capture, monkeypatch
+def test_whether_the_object_turned_says_in_which_axes_light_is_fixed(
+    turned, environment, own, believed, small_capture, monkeypatch
 ):
-    errors = {"turntable": 0.087, "environment": 0.082, "1 lamp": 0.106, "capture": own}
+    errors = {"turntable": 0.087, "environment": environment, "1 lamp": 0.106, "capture": own}
     capture = mi_ring.load_capture(small_capture)
     trials = CoarseFits(capture, mi_ring.Config.preset("fast", light="auto"))
     monkeypatch.setattr(trials, "error", lambda lighting: errors[str(lighting)])
     monkeypatch.setattr(trials, "brightest", lambda count: Lighting("lamps", (((0, 0, 9), (1, 1, 1)),)))
     monkeypatch.setattr(light_selection, "is_unlit", lambda capture: own is None)
-    assert str(trials.likeliest(still)) == believed
+    assert str(trials.likeliest(turned)) == believed
 
 
 @pytest.mark.parametrize(("errors", "believed", "limit"), [
@@ -118,7 +120,7 @@ def test_a_background_that_stands_still_says_that_light_is_fixed_in_the_camera(
     ({"turntable": None, "capture": 0.1, "environment": 0.08, "1 lamp": 0.2, "2 lamps": 0.2, "3 lamps": 0.2,
       "1 distant lamp": 0.2, "environment on one material": 0.1}, "environment", "turntable 0.6"),
 ])  # fmt: skip
-def test_in_front_of_a_background_that_stands_still_a_turntable_is_tried_first(
+def test_for_an_object_that_turned_a_turntable_is_tried_first(
     errors, believed, limit, small_capture, monkeypatch, capsys
 ):
     def error(trials, lighting):
@@ -127,7 +129,7 @@ def test_in_front_of_a_background_that_stands_still_a_turntable_is_tried_first(
         trials.found[lighting] = lighting
         return trials.errors[lighting]
 
-    monkeypatch.setattr(light_selection, "stands_still", lambda capture: True)
+    monkeypatch.setattr(light_selection, "object_turned", lambda capture: True)
     monkeypatch.setattr(CoarseFits, "error", error)
     lamp = (0.0, 0.0, 9.0), (1.0, 1.0, 1.0)
     monkeypatch.setattr(CoarseFits, "brightest", lambda _, n, distant=False: Lighting("lamps", (lamp,) * n, distant))
@@ -161,6 +163,7 @@ def test_errors_that_are_no_numbers_are_left_out(wrong, ends, small_capture, mon
 
     config, capture = mi_ring.Config.preset("fast", light="environment"), mi_ring.load_capture(small_capture)
     monkeypatch.setattr(light_selection, "Fit", Trial)
+    monkeypatch.setattr(light_selection, "object_turned", lambda capture: None)
     if ends:
         with pytest.raises(InputError, match="small.xml: a coarse fit .* has no finite error"):
             mi_ring.choose_lighting(capture, config)

@@ -1,4 +1,4 @@
-"""Tells from the background whether the camera stood still while the object turned in front of it."""
+"""Tells whether the background is the same in photographs from several sides of the object."""
 
 from collections.abc import Callable
 from functools import partial
@@ -23,20 +23,20 @@ COARSE = 3.0  #: standard deviation of the blur that is subtracted [px]: light a
 VARIED = 0.01  #: least standard deviation of what remains in a square, relative to the background's mean
 DARK = 0.02  #: pixels below this share of the background's mean are left out: borders of undistorted photographs
 TURNED = 10.0  #: least rotation between the cameras of two photographs that are compared [degrees]
-STILL = 0.3  #: largest difference of backgrounds that are the same
+STILL, MOVED = 0.3, 0.7  #: largest difference of backgrounds that are the same, and least one of others
 
 
-def stands_still(capture: Capture) -> bool:
-    """Test whether the camera stood still: photographs from other sides of the object have the same background.
+def background_moves(capture: Capture) -> bool | None:
+    """Test whether photographs from other sides of the object have other backgrounds.
 
-    False: the background moves, or it does not tell: it is black, plain, cut out or cannot be read, or too few
+    None: the background does not tell. It is black, plain, cut out or cannot be read, it moves only in part, or too few
     photographs have masks.
     """
     try:
         found = background_difference(capture)
     except InputError:  # a file has gone, of which the fit needs only what is cached
-        return False
-    return found is not None and found <= STILL
+        return None
+    return None if found is None or STILL < found < MOVED else found >= MOVED
 
 
 def background_difference(capture: Capture) -> float | None:

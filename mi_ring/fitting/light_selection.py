@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from mi_ring.calibration.unknowns import OWN_LIGHTS, UNKNOWNS
-from mi_ring.capture.background import stands_still
 from mi_ring.capture.capture import ALBEDO, Capture
+from mi_ring.capture.turntable import object_turned
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
@@ -57,16 +57,19 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     if exposed.max() > ALIKE * exposed.min():
         print(f"Light: those of the scene differ in strength, by up to {exposed.max() / exposed.min():.2g} times, "
               "which an unknown light takes to be how the photographs were exposed")  # fmt: skip
-    trials, still = CoarseFits(capture, config), False
+    trials, turned = CoarseFits(capture, config), None
     if config.light in ("environment", "turntable"):
         found = Lighting(config.light)
     elif config.light == "lamps":
         found = trials.lamps()
     else:
-        if still := stands_still(capture):
+        turned = object_turned(capture)
+        if turned:
             print("Light: the background is the same from several sides of the object, so the object turned")
-            still = math.isfinite(trials.error(Lighting("turntable")))
-        found = trials.likeliest(still)
+            turned = math.isfinite(trials.error(Lighting("turntable"))) or None
+        elif turned is False:
+            print("Light: cameras or background moved around the object, so it did not turn")
+        found = trials.likeliest(turned)
         if found.kind in ("environment", "lamps"):  # several lamps are between one and an environment
             found = trials.best(found, trials.lamps())
     if math.isinf(trials.error(found)):
@@ -77,14 +80,14 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
     if Lighting("capture") in trials.errors:
         rule += ("; those of the scene are kept unless another leaves at most {environment:g} of their error, "
-                 "turntable {turntable:g}").format(**limits(still))  # fmt: skip
+                 "turntable {turntable:g}").format(**limits(turned))  # fmt: skip
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
     return found
 
 
-def limits(still: bool) -> dict[str, float]:
-    """Return `BETTER`, as it is for a background that stands still or not."""
-    return BETTER | ({"turntable": BETTER["environment"]} if still else {})
+def limits(turned: bool | None) -> dict[str, float]:
+    """Return `BETTER`, as it is for an object that turned, did not turn, or of which this is not known."""
+    return BETTER | ({"turntable": BETTER["environment"]} if turned else {})
 
 
 class CoarseFits:
@@ -137,18 +140,19 @@ class CoarseFits:
         """
         return min(lightings, key=self.error)
 
-    def likeliest(self, still: bool) -> Lighting:
+    def likeliest(self, turned: bool | None) -> Lighting:
         """Find the lighting that explains the photographs best, with one lamp at most. Runs coarse fits.
 
-        `still`: True if the background stands still. Then no light is fixed in the world: the object turned.
+        `turned`: True if the object turned: no light is fixed in the world. False if it did not: none is fixed in the
+        camera. None: not known.
         """
-        likely = [Lighting("turntable")]
-        if not still:
+        likely = [] if turned is False else [Lighting("turntable")]
+        if not turned:
             likely.insert(0, Lighting("environment"))
             if math.isfinite(self.error(likely[0])):  # the environment shows where lamps are
                 likely.insert(1, self.brightest(1))
         if not is_unlit(self.capture):
-            own, shares = Lighting("capture"), limits(still)
+            own, shares = Lighting("capture"), limits(turned)
             likely = [one for one in likely if self.error(one) < shares[one.kind] * self.error(own)] or [own]
         return self.best(*likely)
 
