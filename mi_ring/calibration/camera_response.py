@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from mi_ring.images import contrasted
 
@@ -120,8 +121,7 @@ def contrast_slope(
     Returns a tensor of the shape of `recorded`. It is 0 at full scale and above.
     """
     known, _ = response.factors(recorded, index, cosines if response.has_vignetting else None)
-    gammas = response.gammas[index].to(recorded).view(-1, 1, 1, 1)
-    x = (recorded * known).clamp(BLACK, 1 - BLACK) ** gammas
-    v = torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    of_encoded = torch.where(x <= 0.0031308, 1.0, 2.4 * v / (v + 0.055))  # d log x / d log v
-    return of_encoded * (1 - v) * torch.logit(v) / gammas
+    values, one = (recorded * known).clamp(BLACK, 1 - BLACK), torch.ones(()).to(recorded)
+    with forward_ad.dual_level():
+        changed = with_contrast(values, forward_ad.make_dual(one, one), response.gammas[index])
+        return forward_ad.unpack_dual(changed.log()).tangent
