@@ -26,9 +26,7 @@ LEAST_TILT = 0.1  #: and at least this
 #: wrong material, may explain as much.
 DOUBT_OF_CONE, DOUBT_OF_CONTRAST = 0.05, 0.01
 RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
-#: Largest number of iterations in which photographs are compared. Later a contrast would be lost bit by bit to the
-#: material. Steps go on toward the last solution.
-LOOKS = 80
+LOOKS = 80  #: number of iterations in which the contrast is solved for: later the material would take it bit by bit
 GRAZING = 0.2  #: cosine between normal and light below which the change of brightness no longer grows
 COLUMNS = 8  #: of `columns`
 CONE, CONTRAST, SHOWN, AWAY, PLACE = [0, 1, 2], [3], [4], [5], [6, 7]  #: numbers of them
@@ -69,10 +67,9 @@ class BrightnessSolver(torch.optim.Optimizer):
 
         Only differences within a photograph and colour count, so its exposure does not matter.
         """
-        looks = self.state[self.first]["looks"]
-        if it.progress < START or looks >= LOOKS:
+        if it.progress < START:
             return
-        looks += 1
+        self.state[self.first]["looks"] += 1
         index, rig = it.batch.photographs, self.calibration.rig
         directions = self.calibration.directions(index, it.batch.scale)
         pixels = (it.object_pixels() & ~it.observation.clipped.any(-1)).cpu()
@@ -119,7 +116,7 @@ class BrightnessSolver(torch.optim.Optimizer):
             change = rate * (cone - now[:3])
             calibration.get_parameter("falloff").add_(change[0] / calibration.widths["falloff"])
             calibration.get_parameter("tilt").add_(change[1:] / calibration.widths["tilt"])
-        if "contrast" in calibration.unknowns:
+        if "contrast" in calibration.unknowns and self.state[self.first]["looks"] <= LOOKS:
             # Without the column of another exponent: it is almost the same.
             width = calibration.widths["contrast"]
             contrast = estimate(known, CONTRAST, CONE + AWAY, torch.tensor([width]), DOUBT_OF_CONTRAST)
