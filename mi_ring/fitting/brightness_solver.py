@@ -59,7 +59,8 @@ class BrightnessSolver(torch.optim.Optimizer):
     def look(self, it: Iteration) -> None:
         """Compare observed and predicted brightness of the pixels of each photograph of an iteration.
 
-        Only differences within a photograph and colour count, so its exposure does not matter.
+        Only differences within a photograph and colour count, so its exposure does not matter. Photographs without a
+        light of their own are left out if there are others.
         """
         looks = self.state[self.first]["looks"]
         if it.progress < START or looks >= LOOKS:
@@ -73,7 +74,7 @@ class BrightnessSolver(torch.optim.Optimizer):
         bright = torch.minimum(observed, predicted) > BLACK * it.context.exposure
         found = torch.zeros(len(index), 7, 7)
         for n, inside in enumerate(pixels):
-            for colour in range(3):
+            for colour in range(3 if rig.lit[index[n]] or not rig.mixed else 0):
                 chosen = inside & bright[n, ..., colour]
                 if int(chosen.sum()) < ENOUGH:
                     continue
@@ -99,7 +100,7 @@ class BrightnessSolver(torch.optim.Optimizer):
         rate, now = self.param_groups[0]["lr"], self.numbers()
         if "falloff" in calibration.unknowns:
             rig = calibration.rig
-            given = float(rig.views.cone[:, 0].mean())
+            given = float(rig.views.cone[rig.mainly, 0].mean())
             aimed = 0.0 if rig.turned else max(AIMED * abs(given + float(now[0])), LEAST_TILT)
             widths = torch.tensor([calibration.widths["falloff"], aimed, aimed])
             cone = estimate(known, CONE, CONTRAST + SHOWN + AWAY, widths, DOUBT_OF_CONE)

@@ -6,8 +6,8 @@ from pathlib import Path
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import WEIGHTS, Config
-from mi_ring.fitting.setting_types import as_typed
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.setting_types import as_typed
 from mi_ring.fitting.start import StateError
 from mi_ring.objects.ring_file import read_state
 from mi_ring.system.files import digest, is_sealed, relative_to, write_state
