@@ -71,10 +71,6 @@ class Common:
     none: the fit ignores these masks. In a dark room the bright pixels of each photograph become its mask.
     In a lit room the fit then uses no mask. The fit measures in the photographs whether the room is dark.
     auto: given if the scene file has masks, otherwise none. To use no mask in any case, set --weights.mask 0."""
-    pairs: Literal["both", "subtract"] = "both"
-    """What the fit does with photographs that name an image `ambient`: the same view without the photograph's light.
-    both: it subtracts this image, and fits it, too, as a photograph in the light of the room, which it finds.
-    subtract: it only subtracts this image."""
     domain: Literal["auto", "sphere", "hull"] | tuple[Literal["mesh"], Path] = "auto"
     """The start surface that the fit deforms. The fitted surface has the same number of handles (genus).
     hull: the visual hull of the masks. mesh FILE: a closed mesh in scene units. sphere: a sphere around the object.
@@ -173,6 +169,10 @@ class Ablation:
     indirect: bool = True
     """Predict light that the object reflects onto itself (interreflection). It makes concave parts brighter.
     Give --no-indirect if the light intensities in the scene file are wrong."""
+    pairs: Literal["both", "subtract"] = "both"
+    """What the fit does with photographs that name an image `ambient`: the same view without the photograph's light.
+    both: it subtracts this image, and fits it, too, as a photograph in the light of the room, which it finds.
+    subtract: it only subtracts this image."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
     """How the difference of predicted and observed colours is measured.
     l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.

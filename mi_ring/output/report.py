@@ -69,12 +69,10 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
     parts = pipelined(partial(predicted, result, surface), partial(panels_of, result, white(ring)), some)
-    cameras = camera_numbers(capture)  # photographs of one camera are beside each other
-    drawn = sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: (cameras[pair[0]], pair[0]))
-    panels = [panel for _, panel in drawn]
+    cameras = camera_numbers(capture)[shown := np.concatenate(some)]  # photographs of one are beside each other
+    panels = [panel for *_, panel in sorted(zip(cameras, shown, chain(*parts)), key=lambda entry: entry[:2])]
     rows = [row for row, _ in panels]
-    # All photographs on the page may be held-out ones.
-    fitted, errors = zip(*([panel for panel in panels if not panel[0].held_out] or panels))
+    fitted, errors = zip(*([panel for panel in panels if not panel[0].held_out] or panels))  # all may be held out
     masked = [row.iou for row in fitted if row.iou is not None]
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
