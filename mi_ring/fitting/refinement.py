@@ -86,6 +86,7 @@ def refined_of(
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
         names |= {"gain"} if varies_in_exposure(capture) else set()
-    if capture.photographs.mixed and capture.room is None and not shared_emitters(capture.scene):
+    lit = shared_emitters(capture.scene) or (capture.room is not None and capture.room.any())
+    if capture.photographs.mixed and not lit:
         names.add("ambient")  # nothing else lights some of the photographs
     return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))
