@@ -85,7 +85,7 @@ def test_each_photograph_has_its_own_lights():
 
 def test_an_ambient_image_becomes_a_photograph(pairs):
     """Of the same camera and mask, in the light of the room alone. The other one stays the difference."""
-    both, alone = mi_ring.load_capture(pairs), mi_ring.load_capture(pairs, pairs="subtract")
+    both, alone = mi_ring.load_capture(pairs, pairs="both"), mi_ring.load_capture(pairs, pairs="subtract")
     assert len(alone) == VIEWS and len(both) == 2 * VIEWS and both.photographs.mixed
     assert [shot.name for shot in both.shots[VIEWS:]] == [f"{k:03}_room" for k in range(VIEWS)]
     assert both.names[3] == "images/003.exr" and both.names[VIEWS + 3] == "ambient/003.exr"
@@ -100,13 +100,13 @@ def test_an_ambient_image_becomes_a_photograph(pairs):
     masks = both.masks.part([0, 1]).replaced({1: None})
     some = replace(alone.part([0, 1]), masks=masks)
     assert [shot.name for shot in with_room_photographs(some).shots] == ["000", "001", "000_room"]
-    with pytest.raises(InputError, match="pairs: is twice, must be one of both, subtract"):
+    with pytest.raises(InputError, match="pairs: is twice, must be one of subtract, both"):
         mi_ring.load_capture(pairs, pairs="twice")
 
 
 def test_what_is_open_of_pairs_and_of_others(pairs):
     """The room always, as nothing else lights some photographs; the exposure of those that belong to no flash."""
-    both = mi_ring.load_capture(pairs)
+    both = mi_ring.load_capture(pairs, pairs="both")
     assert both.known and refined_of(both, mi_ring.Config(), "capture", 0.5) == ("ambient",)
     assert refined_of(both, mi_ring.Config(refine=("none",)), "capture", 0.5) == ("ambient",)
     guess = replace(both, shots=tuple(replace(shot, calibrated=False) for shot in both.shots))
@@ -198,7 +198,7 @@ def test_power_is_that_of_lit_photographs_and_gain_that_of_others(pairs):
 def fitted(pairs, tmp_path_factory):
     """(Fit of the pairs, its folder). Some photographs are held out."""
     folder = tmp_path_factory.mktemp("fitted") / "run"
-    capture = mi_ring.load_capture(pairs)
+    capture = mi_ring.load_capture(pairs, pairs="both")
     with threads_of(1):
         fit = mi_ring.Fit(capture, mi_ring.Config.preset("fast", **TINY | {"holdout": 5, "detail": "none"}))
         fit.run()
@@ -262,7 +262,7 @@ def test_deviations_of_both_kinds(fitted):
 
 
 def test_check_measures_them_by_what_they_get(pairs):
-    both = mi_ring.load_capture(pairs)
+    both = mi_ring.load_capture(pairs, pairs="both")
     rows = measure(both, np.zeros(3), float(AXES.max()), {})
     assert all(row.angle is None for row in rows[VIEWS:]) and all(row.angle is not None for row in rows[:VIEWS])
     brightness = np.array([row.brightness for row in rows])
@@ -272,7 +272,7 @@ def test_check_measures_them_by_what_they_get(pairs):
 def test_missing_photographs_of_scenes_without_ids_are_added(pairs, tmp_path):
     from mi_ring.capture.scenefile import with_missing_photographs
 
-    both = mi_ring.load_capture(pairs)
+    both = mi_ring.load_capture(pairs, pairs="both")
     scene = ElementTree.fromstring(both.xml)
     for sensor in scene.iter("sensor"):
         del sensor.attrib["id"]

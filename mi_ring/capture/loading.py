@@ -30,13 +30,12 @@ from mi_ring.scene.xml_elements import require_parts
 from mi_ring.system.progress import progress
 
 PLACES = {"point": "position", "directional": "direction"}  #: what says where a light is
-PAIRS = "both"  #: what is done with pairs by default
 MANY = 2**28  #: if photographs have more pixels in total, at first only their headers are read
 
 
 def load_capture(
     path: str | Path, images: bool = True, masks: str = "given", width: int | None = None, crop: bool = True,
-    pairs: str = PAIRS,
+    pairs: str = "subtract",
 ) -> Capture:  # fmt: skip
     """Read a scene file with photographs. Raises InputError for anything that cannot be fitted.
 
@@ -47,12 +46,12 @@ def load_capture(
     masks by brightness if the scene has none. "none" ignores the masks of the scene, and makes masks by brightness.
     These need a dark room. If the room was lit, there are no masks then.
 
-    `pairs` is one of "both" and "subtract". It is for photographs with an image `ambient`, which is always subtracted.
-    "both" makes this image another photograph, which the room alone lights, unless the scene gives no mask of it.
+    `pairs` is one of "subtract" and "both". It is for photographs with an image `ambient`, which is always subtracted.
+    "both" also makes this image another photograph, which the room alone lights, unless the scene gives no mask of it.
     """
     path = Path(path)
-    if pairs not in ("both", "subtract"):
-        raise InputError(f"pairs: is {pairs}, must be one of both, subtract")
+    if pairs not in ("subtract", "both"):
+        raise InputError(f"pairs: is {pairs}, must be one of subtract, both")
     if masks not in ("given", "auto", "none"):
         raise InputError(f"masks: is {masks}, must be one of given, auto, none")
     require_variant(path)

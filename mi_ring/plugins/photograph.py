@@ -29,8 +29,7 @@ class Photograph(mi.Sensor):
                                   instance beyond the border of a lens whose distortion was undone.
                                   Default: none, all of it shows something
     ``ambient``      string       image file of the same view and the same exposure, without the
-                                  photograph's own light. A fit subtracts it, and fits it, too, as
-                                  another photograph. Default: none
+                                  photograph's own light. A fit subtracts it. Default: none
     ``fx``, ``fy``   float        focal lengths [px]
     ``cx``, ``cy``   float        principal point [px]. The image spans [0, W] × [0, H]: the centre of
                                   the first pixel is (0.5, 0.5). Default: the middle of the film
