@@ -48,7 +48,9 @@ def run(arguments: Sequence[str], processes: Processes) -> int:
     folder = config.folder
     processes.agreed(lambda: None if processes.rank == 0 else same_variant(config.variant))
     keep_memory()
-    capture = processes.agreed(lambda: load_capture(config.scene, masks=config.masks, width=max(WIDTH, *config.widths)))
+    width = max(WIDTH, *config.widths)
+    load = partial(load_capture, config.scene, masks=config.masks, width=width, pairs=config.pairs)
+    capture = processes.agreed(load)
     if capture.shape.ring is not None:
         print(f"{config.scene}: contains a fitted object. The fit ignores it and starts anew")
     if capture.threshold is not None:

@@ -19,7 +19,7 @@ from mi_ring.calibration.light_tensors import LightTensors
 from mi_ring.calibration.rig import Estimate, Rig
 from mi_ring.calibration.room_light import RoomLight
 from mi_ring.calibration.unknown import Unknown
-from mi_ring.calibration.unknowns import UNKNOWNS, centred
+from mi_ring.calibration.unknowns import UNKNOWNS, Exposure
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import undistortion_factor
@@ -65,7 +65,7 @@ class Calibration(nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(unknown.shape(rig))))
         given = capture.room
         room = torch.zeros(BASIS, 3) if given is None else rig.power * torch.from_numpy(given).float()
-        alone = capture.photographs.dark and not shared_emitters(capture.scene)
+        alone = not capture.photographs.lit.all() and not shared_emitters(capture.scene)
         self.room = RoomLight(room, rig.exposure, frames, alone)
 
     def value(self, name: str) -> Tensor:
@@ -107,10 +107,10 @@ class Calibration(nn.Module):
     def solves_room(self, progress: float) -> bool:
         """Test whether the fit estimates the room's light at the current `progress` of the fit, 0 to 1.
 
-        It does so only with `--refine ambient`: from the start if the room's light is the only light, otherwise from
-        progress 0.15 on.
+        It does so only with `--refine ambient`: from the start if the room's light is the only light of photographs,
+        otherwise from progress 0.15 on.
         """
-        return "ambient" in self.refined and (self.rig.dark or progress >= ROOM_START)
+        return "ambient" in self.refined and (not self.rig.lit.all() or progress >= ROOM_START)
 
     @torch.no_grad()
     def relight(self, surface: Surface) -> None:
@@ -201,7 +201,7 @@ class Calibration(nn.Module):
 
     @torch.no_grad()
     def room_share(self, harmonics: Tensor) -> Tensor:
-        """Compare the room's light with the photographs' own lights at the object.
+        """Compare the room's light with the photographs' own lights, of those that have one, at the object.
 
         Returns a ratio (3,), one for each colour. `harmonics` (BASIS, 3): the room's light. The ratio is the mean
         irradiance by the room, divided by the irradiance of a surface that faces the photograph's light. If photographs
@@ -210,7 +210,7 @@ class Calibration(nn.Module):
         now = self()
         distance2 = torch.where(self.rig.finite, (now.places - self.rig.center).square().sum(-1, keepdim=True), 1.0)
         mean = math.pi * harmonics[0].cpu() / math.sqrt(4 * math.pi)
-        own = (now.strengths / distance2).median(0).values
+        own = (now.strengths / distance2)[self.rig.mainly].median(0).values
         return mean / own if bool((own > 0).all()) else mean / math.pi
 
     def prior(self) -> Tensor:
@@ -249,17 +249,21 @@ class Calibration(nn.Module):
         gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))
         gains = np.ones((len(self.rig), 3))
         if "gain" in self.refined:
-            gains = centred(self.value("gain"), self.rig).double().exp().numpy()
+            unknown = self.unknowns["gain"]
+            assert isinstance(unknown, Exposure)
+            gains = unknown.centred(self.value("gain"), self.rig).double().exp().numpy()
         # The curve keeps the exposure here, and full scale in a scene file.
         level = self.rig.exposure ** ((1 - gamma) / gamma)
         lights = LightTensors(views.places, self.rig.finite, level * views.strengths.double()).lights()
         views = Views(*(part.double().numpy() for part in views))
         shots = []
         for k, shot in enumerate(capture.shots):
-            falloff, left, up = views.cone[k].tolist()
             response = shot.response.changed(gamma, contrast, float(self.value("vignetting")), gains[k])
-            shots.append(replace(shot, camera=views.camera(k, shot.size), light=lights[k],
-                                 falloff=falloff, tilt=(left, up), response=response))  # fmt: skip
+            shot = replace(shot, camera=views.camera(k, shot.size), response=response)
+            if not self.rig.mixed or self.rig.lit[k]:
+                falloff, left, up = views.cone[k].tolist()
+                shot = replace(shot, light=lights[k], falloff=falloff, tilt=(left, up))
+            shots.append(shot)
         scene, room = capture.scene, None
         if "lamps" in self.refined:
             scene = with_lamps(scene, lamps._replace(strengths=level * lamps.strengths).lights())

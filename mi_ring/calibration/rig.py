@@ -9,6 +9,7 @@ from torch import Tensor
 from mi_ring.calibration.camera_response import CameraResponse
 from mi_ring.calibration.light_tensors import LightTensors
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.pairs import camera_numbers
 from mi_ring.geometry.camera import distortion_range
 from mi_ring.geometry.rotations import quarter_turns
 from mi_ring.rendering.views import Views
@@ -38,20 +39,21 @@ class Estimate:
 class Rig:
     """Cameras and lights as the capture gives them, as tensors that stay constant during a fit.
 
-    Photographs with equal focal lengths and distortion share a lens. Photographs with the same light position share the
-    place of a light. A flash that moves with the camera has one place for all photographs, in camera coordinates.
+    Photographs with equal focal lengths and distortion share a lens. Those with and without their own light that have
+    equal cameras share the pose of the camera. Photographs with the same light position share the place of a light. A
+    flash that moves with the camera has one place for all photographs, in camera coordinates.
     """
 
     def __init__(
         self, capture: Capture, center: np.ndarray, exposure: float, fitted: np.ndarray | None = None,
-        power: float = 1.0, guessed: bool = False, ahead: bool = True, lamps: bool = False,
+        power: float = 1.0, guessed: bool = False, ahead: bool = True, lamps: bool = False, powers: bool = False,
     ) -> None:  # fmt: skip
         """Take cameras and lights from a capture.
 
         `center` (3,): centre of the object. `exposure`: mean radiance of the object. `fitted`: indices of the
         photographs that are fitted; default: all. `power`: initial factor of all lights. `guessed`: the places of the
         lights are guesses, not measurements. `ahead`: the fit may also move a flash along the camera's axis. `lamps`:
-        the fit refines the scene's own lamps.
+        the fit refines the scene's own lamps. `powers`: the fit refines the power of each photograph's light.
         """
         self.path, self.exposure, self.power, self.guessed = capture.path, exposure, power, guessed
         lights = capture.photographs.lights
@@ -60,8 +62,17 @@ class Rig:
         self.sizes = [shot.size for shot in capture.shots]
         frames = [shot.frame for shot in capture.shots]
         self.frames = torch.from_numpy(np.stack(frames)).float()  #: (P, 2, 2) corners of the whole photographs [px]
-        self.dark = capture.photographs.dark  #: Have photographs no lights of their own?
+        photographs, mainly = capture.photographs, capture.photographs.mainly
+        self.mixed = photographs.mixed  #: Have some photographs lights of their own, and others none?
+        self.lit = torch.from_numpy(photographs.lit)  #: (P,) which photographs have one
+        self.mainly = mainly  #: indices of these; of all photographs if there are none
         self.fitted = torch.arange(len(capture.shots)) if fitted is None else torch.from_numpy(fitted)
+        #: (n,) indices of the fitted photographs whose power or gain is unknown. Where both are refined, the gain is
+        #: that of photographs without a light of their own.
+        dark = self.fitted[~self.lit[self.fitted]]
+        self.exposed = {"power": self.fitted[self.lit[self.fitted]] if self.mixed else self.fitted,
+                        "gain": dark if self.mixed and powers else self.fitted}  # fmt: skip
+        self.camera = torch.from_numpy(camera_numbers(capture))  #: (P,) number of each photograph's camera
         self.lamps = LightTensors.of(lamp_lights(capture.scene) if lamps else [])  #: that are unknown
 
         self.center = torch.from_numpy(np.asarray(center)).float()
@@ -71,20 +82,24 @@ class Rig:
         of_world = self.views.cameras[:, :, :3]
         in_camera = torch.einsum("pji,pj->pi", of_world, self.views.places - self.views.cameras[:, :, 3])
         #: (P, 3, 3) quarter turns of photographs that were taken with the camera on its side
-        self.held = quarter_turns(in_camera, RIGID * self.distance)
-        upright = (self.held.mT @ in_camera[..., None])[..., 0]
+        self.held = torch.eye(3).repeat(len(in_camera), 1, 1)
+        self.held[mainly] = quarter_turns(in_camera[mainly], RIGID * self.distance)
+        upright = (self.held[mainly].mT @ in_camera[mainly, :, None])[..., 0]
         self.upright = upright.mean(0)  #: (3,) place of the flash in the axes of a camera that is held upright
         spread = float((upright.amax(0) - upright.amin(0)).max())
-        rigid = self.finite.all() and spread < RIGID * self.distance and not guessed
+        rigid = self.finite[mainly].all() and spread < RIGID * self.distance and not guessed
         #: (P, 3) places of the lights in the cameras' axes if they are one flash that moves with the camera, else None
         self.flash = in_camera if rigid else None
+        if self.flash is not None and self.mixed:
+            self.flash = torch.where(self.lit[:, None], in_camera, self.upright)
         self.free = torch.tensor([1.0, 1.0, float(ahead or self.flash is None)])  #: components of the lights' offset
 
         focal = np.stack([shot.whole.camera.focal for shot in capture.shots])
         kinds = np.column_stack([focal.round(3), views.distortion.round(6)])
         lens = np.unique(kinds, axis=0, return_inverse=True)[1].ravel()
         relative = lights.positions() / np.where(lights.is_finite(), self.distance, 1.0)[:, None]
-        place = np.unique(relative.round(6), axis=0, return_inverse=True)[1].ravel()
+        place = np.zeros(len(relative), int)
+        place[mainly] = np.unique(relative[mainly].round(6), axis=0, return_inverse=True)[1].ravel()
         self.lens = torch.from_numpy(lens)  #: (P,) number of each photograph's lens
         self.place = torch.from_numpy(place if self.flash is None else np.zeros_like(place))  #: (P,) of its light
         self.response = CameraResponse(
@@ -98,19 +113,19 @@ class Rig:
         return len(self.lens)
 
     def count(self, per: str) -> int:
-        """Return the number of photographs, lenses, places of lights, or lamps in the scene.
+        """Return the number of photographs, cameras, lenses, places of lights, or lamps in the scene.
 
-        `per`: "photograph", "lens", "light" or "lamp".
+        `per`: "photograph", "camera", "lens", "light" or "lamp".
         """
-        several = {"photograph": len(self), "lens": int(self.lens.max()) + 1, "light": int(self.place.max()) + 1,
-                   "lamp": len(self.lamps.places)}  # fmt: skip
-        return several[per]
+        if per in ("photograph", "lamp"):
+            return len(self if per == "photograph" else self.lamps.places)
+        return int({"camera": self.camera, "lens": self.lens, "light": self.place}[per].max()) + 1
 
     @property
     def open_cone(self) -> bool:
         """True if the lights are one flash beside the lens, and the capture does not tell its cone."""
         beside = float(self.upright[:2].norm()) < BESIDE * self.distance
-        return self.flash is not None and beside and not self.views.cone.any()
+        return self.flash is not None and beside and not self.views.cone[self.mainly].any()
 
     @property
     def turned(self) -> bool:

@@ -36,8 +36,8 @@ class RoomLight(nn.Module):
         """Start from the harmonics `given` (BASIS, 3). `exposure`: mean radiance of the object.
 
         `frames`: the axes, "world" or "camera", whose harmonics are estimated; the others stay as given. If both were
-        estimated, they could imitate a flash elsewhere or another reflectance. `alone`: there is no other light. Then
-        more harmonics are estimated, as soon as the shape is no longer coarse.
+        estimated, they could imitate a flash elsewhere or another reflectance. `alone`: there is no other light, or
+        none in some photographs. Then more harmonics are estimated, as soon as the shape is no longer coarse.
         """
         super().__init__()
         self.exposure, self.frames, self.alone = exposure, tuple(frames), alone
@@ -118,9 +118,9 @@ class RoomLight(nn.Module):
     def believed(self, more: Tensor, free: list[int]) -> float:
         """Return the factor, 0 to 1, of room light that is believed. `more` (3, J): of the harmonics `free`, as solved.
 
-        It is 1 if there is no flash, and if the capture tells of a room. Otherwise it depends on the mean share of this
-        light in the photographs and on its error: colours that differ tell how large that is, but it is at least
-        `DOUBT`. The form is that of "Estimation with quadratic loss" (James and Stein 1961).
+        It is 1 if some photographs have no flash, and if the capture tells of a room. Otherwise it depends on the mean
+        share of this light in the photographs and on its error: colours that differ tell how large that is, but it is
+        at least `DOUBT`. The form is that of "Estimation with quadratic loss" (James and Stein 1961).
         """
         if self.alone or self.given.any():
             return 1.0

@@ -25,8 +25,12 @@ class Found(NamedTuple):
     several: bool  #: Are the photographs' lights the first of several unknown lamps?
 
     def means(self, of: Callable[[Shot], float]) -> tuple[float, float]:
-        """Return the mean of the number `of(shot)` over all photographs: (before the fit, after the fit)."""
-        before, after = (float(np.mean([of(shot) for shot in side.shots])) for side in (self.before, self.after))
+        """Return the mean of the number `of(shot)` over all photographs: (before the fit, after the fit).
+
+        Photographs without a light of their own are left out if there are others.
+        """
+        sides = ([side.shots[k] for k in self.rig.mainly] for side in (self.before, self.after))
+        before, after = (float(np.mean([of(shot) for shot in shots])) for shots in sides)
         return before, after
 
 
@@ -34,13 +38,13 @@ class Found(NamedTuple):
 class Unknown(ABC):
     """Base class of the unknowns of calibration.
 
-    It has `components` numbers per photograph, lens, light or lamp, or for the whole capture; `per` says which.
+    It has `components` numbers per photograph, camera, lens, light or lamp, or for the whole capture; `per` says which.
     """
 
     name: str
     option: str  #: of `--refine`
     width: float  #: standard deviation of the prior, in the unknown's own unit
-    per: Literal["capture", "photograph", "lens", "light", "lamp"]
+    per: Literal["capture", "photograph", "camera", "lens", "light", "lamp"]
     components: int = 1
     own_lights: bool = False  #: Is it a property of the photographs' own lights?
 
@@ -50,7 +54,7 @@ class Unknown(ABC):
     solved: ClassVar[bool] = False  #: Has it a solver in `fitting`? Others follow their gradient by Adam.
 
     def shape(self, rig: Rig) -> tuple[int, ...]:
-        """Return the shape of the parameter: (number of photographs, lenses, lights or lamps; components).
+        """Return the shape of the parameter: (number of photographs, cameras, lenses, lights or lamps; components).
 
         The first number is missing if `per` is "capture". The second is missing if there is one component.
         """
@@ -69,10 +73,19 @@ class Unknown(ABC):
         """
         if self.per == "lamp":  # all lamps light all photographs
             return [np.full_like(index, k) for k in range(rig.count("lamp"))]
-        numbers = {"lens": rig.lens, "light": rig.place}
+        numbers = {"camera": rig.camera, "lens": rig.lens, "light": rig.place}
         if self.per in numbers:
             return [numbers[self.per][index].numpy()]
         return [index if self.per == "photograph" else np.zeros_like(index)]
+
+    def concerns(self, rig: Rig, lit: bool) -> bool:
+        """Test whether it changes photographs that have a light of their own (`lit`), or those that have none."""
+        return lit or not (self.own_lights and rig.mixed)
+
+    @property
+    def single(self) -> bool:
+        """True if it is of single photographs, or of the cameras of single photographs."""
+        return self.per in ("photograph", "camera")
 
     @abstractmethod
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:

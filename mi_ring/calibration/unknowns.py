@@ -31,7 +31,7 @@ class Turn(Unknown):
     solved = True
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        turned = rig.views.cameras[:, :, :3] @ rotations(value)
+        turned = rig.views.cameras[:, :, :3] @ rotations(value)[rig.camera]
         return now.seen(cameras=torch.cat([turned, now.views.cameras[:, :, 3:]], 2))
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any]:
@@ -45,7 +45,7 @@ class Move(Unknown):
     solved = True
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        along = rig.views.cameras[:, :, :3] @ (value * rig.distance)[..., None]
+        along = rig.views.cameras[:, :, :3] @ (value * rig.distance)[rig.camera, :, None]
         moved = rig.views.cameras[:, :, 3:] + along
         return now.seen(cameras=torch.cat([now.views.cameras[:, :, :3], moved], 2))
 
@@ -105,7 +105,7 @@ class LightPlace(Unknown):
             before, unit = rig.upright.numpy(), rig.distance * rig.free.numpy()
             what = "place of the flash in the cameras' axes: to the left, up, ahead [scene units]"
             return what, before, before + unit * value[0], unit * std[0]
-        first = np.unique(rig.place.numpy(), return_index=True)[1]
+        first = rig.mainly[np.unique(rig.place.numpy()[rig.mainly], return_index=True)[1]]
         places = (side.photographs.lights.positions()[first] for side in (found.before, found.after))
         units = np.where(rig.finite.numpy()[first], rig.distance, 1.0)
         which = "place of the first lamp" if found.several else "places of the lights"
@@ -113,9 +113,21 @@ class LightPlace(Unknown):
 
 
 class Exposure(Unknown):
-    """Base of `Power` and `Gain`: log of a factor for each photograph and channel. In each channel its mean is 0."""
+    """Base of `Power` and `Gain`: log of a factor for each photograph and channel. In each channel its mean is 0.
+
+    It is 0 for photographs that are held out, and for those whose factor is known: see `Rig.exposed`.
+    """
 
     solved = True
+
+    def concerns(self, rig: Rig, lit: bool) -> bool:
+        return bool((rig.lit[rig.exposed[self.name]] == lit).any()) if rig.mixed else True
+
+    def centred(self, value: Tensor, rig: Rig) -> Tensor:
+        """Subtract from log factors (P, 3) their mean over the photographs whose factors are unknown; 0 for others."""
+        result, index = torch.zeros_like(value), rig.exposed[self.name]
+        result[index] = value[index] - value[index].mean(0)
+        return result
 
     def describe_photograph(self, value: np.ndarray, std: np.ndarray, rig: Rig) -> tuple[str, Any, Any]:
         factor = np.exp(value)
@@ -128,7 +140,7 @@ class Power(Exposure):
     changes = "light"
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        return replace(now, log_power=now.log_power + centred(value, rig))
+        return replace(now, log_power=now.log_power + self.centred(value, rig))
 
 
 class Falloff(Unknown):
@@ -159,7 +171,7 @@ class Tilt(Unknown):
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         held = found.rig.held[:, :2, :2].numpy()
-        before, after = (np.einsum("pji,pj->pi", held, [shot.tilt for shot in side.shots]).mean(0)
+        before, after = (np.einsum("pji,pj->pi", held, [shot.tilt for shot in side.shots])[found.rig.mainly].mean(0)
                          for side in (found.before, found.after))  # fmt: skip
         return "tilt of the flash's cone, to the left and up", before, after, std
 
@@ -212,7 +224,7 @@ class Gain(Exposure):
     changes = "gain"
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
-        return replace(now, response=now.response._replace(gain=centred(value, rig).detach().exp()))
+        return replace(now, response=now.response._replace(gain=self.centred(value, rig).detach().exp()))
 
 
 class Scale(Unknown):
@@ -261,8 +273,8 @@ class LampPower(Unknown):
 
 #: All unknowns but the room's light, by name, in the order in which they are applied.
 UNKNOWNS: dict[str, Unknown] = {unknown.name: unknown for unknown in (
-    Turn("turn", "cameras", 0.01, "photograph", 3),
-    Move("move", "cameras", 0.005, "photograph", 3),
+    Turn("turn", "cameras", 0.01, "camera", 3),
+    Move("move", "cameras", 0.005, "camera", 3),
     Focal("focal", "focal", 0.01, "lens"),
     Principal("principal", "principal", 0.01, "lens", 2),
     Distortion("distortion", "distortion", 0.05, "lens"),
@@ -281,13 +293,6 @@ UNKNOWNS: dict[str, Unknown] = {unknown.name: unknown for unknown in (
 
 #: Options about the photographs' own lights, which an unknown light replaces.
 OWN_LIGHTS = {unknown.option for unknown in UNKNOWNS.values() if unknown.own_lights}
-
-
-def centred(value: Tensor, rig: Rig) -> Tensor:
-    """Subtract from log factors (P, 3) their mean over the fitted photographs. Returns 0 for held-out photographs."""
-    result = torch.zeros_like(value)
-    result[rig.fitted] = value[rig.fitted] - value[rig.fitted].mean(0)
-    return result
 
 
 def lens_cameras(found: Found) -> Iterable[list]:

@@ -233,11 +233,11 @@ class Capture:
     def exposure(self) -> float:
         """Estimate the mean linear radiance of the object's pixels (1 = full scale of the files) from some photographs.
 
-        In a photograph without a mask, these are the pixels above 2 % of its maximum. Raises InputError if all of them
-        are black.
+        Those without a light of their own are left out if there are others. In a photograph without a mask, pixels
+        above 2 % of its maximum count. Raises InputError if all of them are black.
         """
-        total, count = 0.0, 0
-        for k in self.spread(SOME):
+        total, count, index = 0.0, 0, self.photographs.mainly
+        for k in index[evenly_spaced(len(index), SOME)]:
             side = min(self.shots[k].size)
             rgb, _, mask, masked, _ = self.observe([k], max(4 if side >= 16 else 1, side // COARSE))
             inside = mask[0] > 0.5 if masked else rgb[0].mean(-1) > 0.02 * rgb.max()
@@ -248,23 +248,24 @@ class Capture:
 
     @functools.cached_property
     def lit_room(self) -> bool:
-        """True if pixels outside the masks are lit. In a dark room, the background is black."""
-        shares = []
+        """True if pixels outside the masks are lit, in photographs with or in those without their own light."""
+        shares: dict[bool, list[float]] = {}
         for k in self.spread(SOME):
             rgb, _, mask, masked, valid = self.observe([k], max(1, min(self.shots[k].size) // COARSE))
             inside, outside = mask[0] > 0.99, blur(mask, 2.0)[0] < 0.01
             if valid is not None:
                 outside &= valid[0]
             if masked and inside.any() and outside.any():
-                shares.append(float(rgb[0][outside].quantile(0.9) / rgb[0][inside].mean().clamp(min=1e-9)))
-        return bool(shares) and float(np.median(shares)) > LIT
+                share = float(rgb[0][outside].quantile(0.9) / rgb[0][inside].mean().clamp(min=1e-9))
+                shares.setdefault(bool(self.photographs.lit[k]), []).append(share)
+        return any(float(np.median(several)) > LIT for several in shares.values())
 
     def reflectance(self, center: np.ndarray, exposure: float) -> float:
         """Estimate the reflectance, radiance / irradiance [1/sr], of the object at `center` (3,) [scene units].
 
         `exposure`: mean radiance of the object. If no known light reaches it, the albedo is assumed to be 0.5.
         """
-        received = float(np.median(self.photographs.irradiance(center).mean(1)))
+        received = float(np.median(self.photographs.irradiance(center)[self.photographs.mainly].mean(1)))
         return exposure / received if received > 0 else ALBEDO / math.pi
 
     @property

@@ -15,6 +15,7 @@ from mi_ring.capture.arrays import FLATTEST
 from mi_ring.capture.brightness_masks import with_masks_by_brightness
 from mi_ring.capture.capture import Capture, require_variant, views_of
 from mi_ring.capture.decoding import read_mask, read_photograph, require_header
+from mi_ring.capture.pairs import with_room_photographs
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.capture.reduction import reduced
 from mi_ring.errors import InputError, SceneError, require_file
@@ -33,8 +34,9 @@ MANY = 2**28  #: if photographs have more pixels in total, at first only their h
 
 
 def load_capture(
-    path: str | Path, images: bool = True, masks: str = "given", width: int | None = None, crop: bool = True
-) -> Capture:
+    path: str | Path, images: bool = True, masks: str = "given", width: int | None = None, crop: bool = True,
+    pairs: str = "subtract",
+) -> Capture:  # fmt: skip
     """Read a scene file with photographs. Raises InputError for anything that cannot be fitted.
 
     `images`: False reads only cameras and lights. This is enough for rendering. `width`: photographs are reduced to at
@@ -43,8 +45,13 @@ def load_capture(
     `masks` is one of "given", "auto" and "none". "given" uses the masks of the scene. "auto" does the same, but makes
     masks by brightness if the scene has none. "none" ignores the masks of the scene, and makes masks by brightness.
     These need a dark room. If the room was lit, there are no masks then.
+
+    `pairs` is one of "subtract" and "both". It is for photographs with an image `ambient`, which is always subtracted.
+    "both" also makes this image another photograph, which the room alone lights, unless the scene gives no mask of it.
     """
     path = Path(path)
+    if pairs not in ("subtract", "both"):
+        raise InputError(f"pairs: is {pairs}, must be one of subtract, both")
     if masks not in ("given", "auto", "none"):
         raise InputError(f"masks: is {masks}, must be one of given, auto, none")
     require_variant(path)
@@ -74,6 +81,9 @@ def load_capture(
     valid = masks_of(shots, "valid", path)
     capture = replace(capture, images=pixels, masks=given, valid=valid)
     by_brightness = masks != "given" and not any(given.given)
+    if pairs == "both":
+        capture = with_room_photographs(capture)
+        shots, pixels, given, valid = capture.shots, capture.images, capture.masks, capture.valid
     many = sum(math.prod(shot.size) for shot in shots) > MANY
     for shot in shots if many or width else ():
         require_headers(shot, path, masks)

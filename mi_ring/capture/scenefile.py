@@ -4,6 +4,7 @@ import math
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
 from mi_ring.rendering.spherical_harmonics import MAX_ORDER, PER_FRAME
 from mi_ring.scene.lights import Light
-from mi_ring.scene.shot import Shot
+from mi_ring.scene.shot import Files, Shot
 from mi_ring.system.files import relative_to
 
 Element = ElementTree.Element
@@ -202,6 +203,23 @@ def with_photographs(scene: bytes, shots: Iterable[Shot]) -> bytes:
     for element in root.findall("sensor[@type='photograph']"):
         root.remove(element)
     root.extend(map(photograph_element, shots))
+    return scene_bytes(root)
+
+
+def with_missing_photographs(scene: bytes, shots: Sequence[Shot], folder: Path) -> bytes:
+    """Return new content for a scene file, with those photographs of `shots` that it lacks at its end.
+
+    `scene`: the old content. `folder`: where the scene file will be. Ids say which photographs it has; without ids, it
+    has the first ones of `shots`.
+    """
+    root = ElementTree.fromstring(scene)
+    ids = [element.get("id", "") for element in root.findall(".//sensor[@type='photograph']")]
+    missing = [shot for shot in shots if shot.name not in ids] if all(ids) else shots[len(ids) :]
+    if not missing:
+        return scene
+    for shot in missing:
+        files = (file and Path(relative_to(folder.resolve(), file.resolve())) for file in shot.files)
+        root.append(photograph_element(replace(shot, files=Files(*files))))
     return scene_bytes(root)
 
 

@@ -126,7 +126,8 @@ def fit_and_watch(run: Run, job: Job, fingerprint: str, options: ExperimentOptio
 
     with threads_of(options.threads):
         config = run.config(options)
-        capture = load_capture(run.dataset.scene, masks=config.masks, width=max(WIDTH, *config.widths))
+        width = max(WIDTH, *config.widths)
+        capture = load_capture(run.dataset.scene, masks=config.masks, width=width, pairs=config.pairs)
         fit = Fit(capture, config, callbacks=[measure], lighting=choose_lighting(capture, config))
         for _ in progress(fit, "iterations", total=fit.iterations):
             pass

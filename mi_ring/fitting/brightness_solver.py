@@ -65,7 +65,8 @@ class BrightnessSolver(torch.optim.Optimizer):
     def look(self, it: Iteration) -> None:
         """Compare observed and predicted brightness of the pixels of each photograph of an iteration.
 
-        Only differences within a photograph and colour count, so its exposure does not matter.
+        Only differences within a photograph and colour count, so its exposure does not matter. Photographs without a
+        light of their own are left out if there are others.
         """
         if it.progress < START:
             return
@@ -79,7 +80,7 @@ class BrightnessSolver(torch.optim.Optimizer):
         bright = torch.minimum(observed, predicted) > BLACK * it.context.exposure
         found = torch.zeros(len(index), COLUMNS + 1, COLUMNS + 1)
         for n, inside in enumerate(pixels):
-            for colour in range(3):
+            for colour in range(3 if rig.lit[index[n]] or not rig.mixed else 0):
                 chosen = inside & bright[n, ..., colour]
                 if int(chosen.sum()) < ENOUGH:
                     continue
@@ -107,7 +108,7 @@ class BrightnessSolver(torch.optim.Optimizer):
         rate, now = self.param_groups[0]["lr"], self.numbers()
         if "falloff" in calibration.unknowns:
             rig = calibration.rig
-            given = float(rig.views.cone[:, 0].mean())
+            given = float(rig.views.cone[rig.mainly, 0].mean())
             aimed = 0.0 if rig.turned else max(AIMED * abs(given + float(now[0])), LEAST_TILT)
             widths = torch.tensor([calibration.widths["falloff"], aimed, aimed])
             others = CONTRAST + SHOWN + AWAY + (PLACE if "light" in calibration.unknowns else [])

@@ -169,6 +169,10 @@ class Ablation:
     indirect: bool = True
     """Predict light that the object reflects onto itself (interreflection). It makes concave parts brighter.
     Give --no-indirect if the light intensities in the scene file are wrong."""
+    pairs: Literal["subtract", "both"] = "subtract"
+    """What the fit does with photographs that name an image `ambient`: the same view without the photograph's light.
+    subtract: it only subtracts this image. both: it also fits it, as a photograph in the light of the room, which it
+    finds. It then sees each photograph half as often: give more --iterations."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
     """How the difference of predicted and observed colours is measured.
     l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.

@@ -48,11 +48,11 @@ class Layout:
 
     def centring(self) -> np.ndarray:
         """Return the matrix (N, N) that subtracts from powers and gains their means, as `Calibration` does."""
-        result, fitted = np.eye(self.count), self.calibration.rig.fitted.numpy()
+        result = np.eye(self.count)
         for name, unknown in self.calibration.unknowns.items():
             if isinstance(unknown, Exposure):
                 for colour in range(3):
-                    at = self.first[name] + 3 * fitted + colour
+                    at = self.first[name] + 3 * self.calibration.rig.exposed[name].numpy() + colour
                     result[np.ix_(at, at)] -= 1 / len(at)
         return result
 
@@ -60,11 +60,13 @@ class Layout:
         """List the components of all unknowns that affect the photographs `index` (n,): (unknown, component, places).
 
         An unknown is given by its name, a component by its number. `places` (n,): for each photograph, the index of
-        this component in the vector of all parameters.
+        this component in the vector of all parameters. All or none of the photographs have a light of their own.
         """
-        result = []
+        result, rig = [], self.calibration.rig
         for name, unknown in self.calibration.unknowns.items():
-            for row in unknown.rows(self.calibration.rig, index):
+            if not unknown.concerns(rig, bool(rig.lit[index[0]])):
+                continue
+            for row in unknown.rows(rig, index):
                 first = self.first[name] + unknown.components * row
                 result += [(name, k, first + k) for k in range(unknown.components)]
         return result
@@ -85,7 +87,9 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
     surface = renderer.show(model, level)
     patches = Patches(surface, ring.domain.sample(level)[0], float(ring.radius), ring.brdf_net.bsdf_parameters)
     colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))
-    for index in problem.capture.together(problem.fitted):
+    lit = problem.capture.photographs.lit[problem.fitted]
+    kinds = [problem.fitted[lit == kind] for kind in (True, False)]
+    for index in (some for kind in kinds for some in problem.capture.together(kind)):
         scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
         group = CovarianceGroup(problem, calibration, surface, patches, ring.indirect, index, scale)
         compare(group, layout, colours, silhouettes)
@@ -159,7 +163,7 @@ class Equations:
 class CovarianceGroup:
     """Photographs of one size, to be rendered from the current model at 1 / `scale` of their width and height.
 
-    `index` (n,): indices of the photographs.
+    `index` (n,): indices of the photographs. All of them have a light of their own, or none of them has.
     """
 
     problem: Problem
@@ -170,6 +174,11 @@ class CovarianceGroup:
     index: np.ndarray
     scale: int
 
+    @property
+    def dark(self) -> bool:
+        """True if the photographs have no light of their own."""
+        return not self.problem.capture.photographs.lit[self.index[0]]
+
     def photographs(self) -> Photographs:
         """Return the cameras and lights of the group for the renderer, with the current calibration.
 
@@ -178,7 +187,7 @@ class CovarianceGroup:
         """
         calibration, photographs = self.calibration, self.problem.capture.selected(self.index, self.scale)
         calibration.relight(self.surface)
-        room = calibration.room_harmonics().cpu().double().numpy() if photographs.dark else None
+        room = calibration.room_harmonics().cpu().double().numpy() if self.dark else None
         return prediction.with_views(replace(photographs, room=room), calibration(self.scale).to(self.problem.device))
 
     def direct(self) -> tuple[Tensor, Tensor]:
@@ -203,7 +212,7 @@ class CovarianceGroup:
             around = GlobalIllumination.of(self.surface, photographs, coverage.to(self.problem.device), 1, paths=SPP,
                                          indirect=indirect, harmonics=calibration.room.which)  # fmt: skip
             bounced = around.interreflection.cpu() if indirect else bounced
-            added = around.occlusion if photographs.dark else around.room_light
+            added = around.occlusion if self.dark else around.room_light
             room_light = added(room.to(self.problem.device)).cpu() if room.any() else room_light
             if unknown:
                 chosen = [around.harmonics.index(k) for k in calibration.room.free]

@@ -30,6 +30,7 @@ class ExposureSolver(torch.optim.Optimizer):
     def __init__(self, calibration: Calibration, name: str) -> None:
         """Solve for the unknown `name` of a calibration: "power" or "gain"."""
         self.tensor, self.width = getattr(calibration, name), calibration.widths[name]
+        self.exposed = {*calibration.rig.exposed[name].tolist()}  #: photographs whose power or gain is unknown
         super().__init__([{"params": [self.tensor]}], {"lr": self.rate.initial})
         self.state[self.tensor] = {"measured": torch.zeros(len(calibration.rig), 5, 3)}
         self.seen: list[int] = []  #: photographs of the last `look`
@@ -53,8 +54,8 @@ class ExposureSolver(torch.optim.Optimizer):
         pixels = it.object_pixels() & ~it.observation.clipped.any(-1)
         floor = BLACK * it.context.exposure
         brighter = torch.full((len(it.batch.photographs), 5, 3), torch.nan)
-        for n, inside in enumerate(pixels):
-            if not inside.any():
+        for n, (k, inside) in enumerate(zip(it.batch.photographs.tolist(), pixels)):
+            if k not in self.exposed or not inside.any():
                 continue
             both = torch.stack([it.observation.rgb[n][inside], it.prediction.rgb[n][inside]])  # (2, pixels, 3)
             quarter = quarters(inside)

@@ -48,8 +48,11 @@ SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
 
 
 def chosen_photographs(given: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
-    """Choose photographs for the texture: at most `MOST_PHOTOGRAPHS`, evenly among those of `fitted` with a file."""
-    found = [int(k) for k in fitted if given.shots[k].files.filename]
+    """Choose photographs for the texture: at most `MOST_PHOTOGRAPHS`, evenly among those of `fitted` with a file.
+
+    Those without a light of their own are left out if there are others: their light is known less well.
+    """
+    found = [int(k) for k in np.intersect1d(fitted, given.photographs.mainly) if given.shots[k].files.filename]
     return [found[place] for place in evenly_spaced(len(found), MOST_PHOTOGRAPHS)]
 
 

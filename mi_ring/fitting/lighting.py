@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mi_ring.calibration.unknowns import OWN_LIGHTS
 from mi_ring.capture.capture import ALBEDO, Capture
+from mi_ring.capture.turntable import object_turned
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.rendering.spherical_harmonics import BASIS, frames_of, without_environment
@@ -95,7 +96,11 @@ def require_compatible(capture: Capture, config: Config) -> None:
                          "the lamps of the scene out, or leave --light out")  # fmt: skip
     if any(shot.files.ambient for shot in capture.shots):
         raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
-                         f"leave out --light {config.light}, or `ambient` in all photographs")  # fmt: skip
+                         f"leave out --light {config.light}: the fit finds the light in `ambient` itself")  # fmt: skip
+    if capture.photographs.mixed:
+        raise InputError(f"{capture.path}: emitter: some photographs have a light of their own, others none, but "
+                         f"--light {config.light} finds one light for all; leave it out: the fit finds that of the "
+                         "others itself")  # fmt: skip
     if capture.threshold is not None or not any(capture.masks.given):
         raise InputError(f"{capture.path}: mask: no photograph has one, and by --light {config.light} the "
                          "background would be taken for the object; give masks, or have mi-ring photos "
@@ -182,6 +187,12 @@ def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray
 
 
 def room_frames(capture: Capture, lighting: Lighting) -> Collection[str]:
-    """Return the axes in which the unknown light of the room is fixed: a collection of "world" and "camera"."""
+    """Return the axes in which the unknown light of the room is fixed: a collection of "world" and "camera".
+
+    If some photographs alone show this light, and the scene does not tell, their cameras and backgrounds tell.
+    """
+    photographs = capture.photographs
+    if photographs.mixed and capture.room is None and object_turned(capture.part(np.flatnonzero(~photographs.lit))):
+        return ["camera"]
     own = {"environment": ["world"], "lamps": ["world"], "turntable": ["camera"]}
     return own.get(lighting.kind, frames_of(capture.scene))

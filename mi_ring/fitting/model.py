@@ -33,7 +33,7 @@ class Model(nn.Module):
         capture, lighting = problem.capture, problem.lighting
         if refined := refinement.refined:
             rig = Rig(capture, center, problem.exposure, problem.fitted, refinement.power, bool(lighting.lamps),
-                      "light" in problem.config.refine, lamps="lamps" in refined)  # fmt: skip
+                      "light" in problem.config.refine, "lamps" in refined, "power" in refined)  # fmt: skip
             self.calibration = Calibration(capture, refined, rig, room_frames(capture, lighting))
             self.calibration.room.to(problem.device)
         self.starts_near = not isinstance(ring.domain, Sphere)  #: from a hull or a mesh

@@ -71,12 +71,16 @@ def detail_steppers(ring: FittedObject, config: Config) -> list[Stepper]:
 def solve_room(calibration: Calibration, it: Iteration) -> None:
     """Estimate the room's light, in place: add an iteration's photographs to the normal equations and solve them.
 
-    Does nothing if the room's light is not refined, or not yet.
+    Does nothing if the room's light is not refined, or not yet. If some photographs have no other light, these alone
+    count: with a flash, its error may be larger than all light of the room.
     """
     other, seen, batch = it.prediction.other_light, it.observation, it.batch
     if other is None or not calibration.solves_room(it.progress):
         return
+    photographs = it.prediction.photographs
+    telling = ~photographs.lit if photographs.mixed else photographs.in_room
     pixels = it.object_pixels() & ~seen.clipped.any(-1)
+    pixels &= torch.from_numpy(telling[batch.photographs]).to(pixels.device)[:, None, None]
     observed = calibration.linear(seen.rgb, batch.photographs, batch.scale)
     calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum)
 

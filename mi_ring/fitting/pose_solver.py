@@ -87,17 +87,20 @@ class PoseSolver(torch.optim.Optimizer):
                                  "it changes with them; give yours another name")  # fmt: skip
         super().__init__([{"params": [calibration.turn, calibration.move]}], {"lr": INITIAL})
         self.rate = Rate(INITIAL, DECAY, NEAR if near else FAR)
-        self.seen: tuple[Tensor, Tensor] | None = None  #: photographs and their curvature
+        self.seen: tuple[Tensor, Tensor] | None = None  #: cameras and their curvature
 
     def look(self, it: Iteration) -> None:
-        """Store the indices of an iteration's photographs and the Gauss-Newton Hessians of its loss, for `step`."""
+        """Store the numbers of an iteration's cameras and the Gauss-Newton Hessians of its loss, for `step`."""
         self.seen = None
         if it.progress >= self.rate.start:
-            self.seen = torch.from_numpy(it.batch.all_photographs), it.batch.share.gathered(curvature(it))
+            calibration = it.context.model.calibration
+            assert calibration is not None
+            cameras = calibration.rig.camera[torch.from_numpy(it.batch.all_photographs)]
+            self.seen = summed(cameras, it.batch.share.gathered(curvature(it)))
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Change the poses of the photographs that `look` has stored, by a Gauss-Newton step.
+        """Change the poses of the cameras that `look` has stored, by a Gauss-Newton step.
 
         Does nothing before refinement begins.
         """
@@ -113,6 +116,17 @@ class PoseSolver(torch.optim.Optimizer):
         step *= group["lr"] * (LONGEST / step.norm(dim=1, keepdim=True)).clamp(max=1)
         turn[index] -= step[:, :3]
         move[index] -= step[:, 3:]
+
+
+def summed(cameras: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum the matrices (n, 6, 6) of photographs with the same camera. Returns (different cameras (m,), sums (m, 6, 6)).
+
+    `cameras` (n,): number of the camera of each photograph.
+    """
+    different, place = cameras.unique(return_inverse=True)
+    if len(different) == len(cameras):
+        return cameras, matrices
+    return different, matrices.new_zeros(len(different), 6, 6).index_add(0, place, matrices)
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.pairs import camera_numbers
 from mi_ring.capture.reduction import WIDTH, reduced
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
@@ -51,11 +52,12 @@ class Problem:
 def held_out_photographs(capture: Capture, every: int) -> np.ndarray:
     """Choose the photographs that are held out of the fit: every n-th from index n // 2 on, with n = `every`.
 
-    Returns their indices. If n is 0, no photograph is held out. Raises InputError if n > 0 and no photograph, or every
-    photograph, would be held out.
+    Photographs of one camera, with and without their own light, are held out together. Returns their indices. If n is
+    0, no photograph is held out. Raises InputError if n > 0 and no photograph, or every photograph, would be held out.
     """
-    several = len(capture)
-    found = np.arange(several)[every // 2 :: every] if every else np.arange(0)
+    several, cameras = len(capture), camera_numbers(capture)
+    chosen = np.unique(cameras)[every // 2 :: every] if every else np.arange(0)
+    found = np.flatnonzero(np.isin(cameras, chosen))
     if every and several < 2:
         raise InputError(f"{capture.path}: --holdout: there is one photograph alone; leave it out")
     if every and not 0 < len(found) < several:

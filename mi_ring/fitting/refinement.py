@@ -10,6 +10,7 @@ from mi_ring.calibration.calibration import OPTIONS
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.capture.decoding import has_open_curve
+from mi_ring.capture.pairs import varies_in_exposure
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.problem import Problem
@@ -46,9 +47,10 @@ class Refinement(NamedTuple):
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo, capture, config = math.pi * reflectance, problem.capture, problem.config
-        asked, several = TOLD_BY_MANY & {*config.refine}, len(problem.fitted) >= FEWEST
+        asked, count = TOLD_BY_MANY & {*config.refine}, len(problem.seen.photographs.mainly)
+        several = count >= FEWEST
         if asked and not several:
-            raise InputError(f"{capture.path}: --refine {min(asked)}: the fit has {len(problem.fitted)} photographs, "
+            raise InputError(f"{capture.path}: --refine {min(asked)}: the fit has {count} photographs, "
                              f"which do not tell it; leave it out, or give at least {FEWEST}")  # fmt: skip
         open_unknowns: set[str] = set()
         if several and "auto" in config.refine and not capture.known:
@@ -78,9 +80,13 @@ def refined_of(
         names |= unknown or ({"ambient"} if auto and not shared_emitters(capture.scene) else set())
         names |= {"gain"} if auto and "power" not in names else set()
     elif auto:
-        subtracted = {"ambient"} if all(shot.files.ambient for shot in capture.shots) else set()
+        subtracted = set() if capture.photographs.in_room.any() else {"ambient"}
         names |= {*open_unknowns} - ({"falloff"} if "vignetting" in names else set())
         names |= {*AUTO} - subtracted - ({"power"} if "gain" in names else set())
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
+        names |= {"gain"} if varies_in_exposure(capture) else set()
+    lit = shared_emitters(capture.scene) or (capture.room is not None and capture.room.any())
+    if capture.photographs.mixed and not lit:
+        names.add("ambient")  # nothing else lights some of the photographs
     return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))

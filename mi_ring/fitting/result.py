@@ -42,6 +42,8 @@ def result_of(
         masked = replace(problem, capture=capture)
         return summary(problem, model, refined, covariance(masked, model, renderer, ring.subdivisions))
 
+    # Otherwise the room's axes are those of the scene file.
+    found_alone = problem.lighting.kind != "capture" or problem.capture.photographs.mixed
     detailed = schedule.stages[-1].detail and "detail" not in course.validation.get("put_back", [])
     if course.iteration == schedule.iterations and detailed and problem.config.detail != "shape":
         capture.clear_caches()
@@ -75,7 +77,7 @@ def result_of(
         validation=course.validation,
         masks=list(course.masks),
         room=room_of(problem, refined) if calibration else None,
-        room_frames=calibration.room.frames if calibration and problem.lighting.kind != "capture" else None,
+        room_frames=calibration.room.frames if calibration and found_alone else None,
         lamps=lamp_lights(refined.scene) if calibration and "lamps" in calibration.refined else None,
     )
 

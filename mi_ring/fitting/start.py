@@ -191,14 +191,15 @@ def require_view_from_outside(capture: Capture, domain: Domain, center: np.ndarr
     `center` (3,), `radius`: the normalising sphere [scene units]. `domain`: the start surface in units of this sphere.
     """
     cameras, lights = [shot.camera for shot in capture.shots], capture.photographs.lights
-    surface = center + radius * domain.points
+    surface, near = center + radius * domain.points, lights.is_finite()
+    near &= capture.photographs.lit | capture.photographs.dark
     ahead = [((surface - camera.position) @ camera.forward).max() for camera in cameras]
     if min(ahead) < 0:
         shot = capture.shots[int(np.argmin(ahead))]
         raise InputError(f'{capture.path}: photograph "{shot.name}", to_world: its camera looks away from the '
                          "surface that the fit starts from; see python -m mi_ring.check")  # fmt: skip
     places = {"to_world: its camera": np.stack([camera.position for camera in cameras]),
-              "emitter: its light": np.where(lights.is_finite()[:, None], lights.positions(), np.inf)}  # fmt: skip
+              "emitter: its light": np.where(near[:, None], lights.positions(), np.inf)}  # fmt: skip
     for what, points in places.items():
         if (inside := domain.contains((points - center) / radius)).any():
             shot = capture.shots[int(inside.argmax())]

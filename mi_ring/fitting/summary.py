@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from mi_ring.calibration.unknown import Found
-from mi_ring.calibration.unknowns import Exposure, centred
+from mi_ring.calibration.unknowns import Exposure
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
@@ -47,17 +47,19 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
                                "harmonics": room.harmonics.tolist()}  # fmt: skip
 
     corners = ring.center.cpu().numpy() + float(ring.radius) * np.concatenate([np.eye(3), -np.eye(3)])
-    single = {name: unknown for name, unknown in calibration.unknowns.items() if unknown.per == "photograph"}
+    single = {name: unknown for name, unknown in calibration.unknowns.items() if unknown.single}
     for name, unknown in single.items():
         if isinstance(unknown, Exposure):
-            values[name] = centred(calibration.value(name), rig).double().numpy(force=True)
+            values[name] = unknown.centred(calibration.value(name), rig).double().numpy(force=True)
     photographs: dict[str, dict[str, Any]] = {}
     for k in problem.fitted:
         before, after = (side.shots[k].whole.camera.project(corners)[0] for side in (capture, refined))
         own: dict[str, Any] = {"moved_px": float(np.linalg.norm(after - before, axis=1).mean())}
         std: dict[str, Any] = {}
         for name, unknown in single.items():
-            if entry := unknown.describe_photograph(values[name][k], deviations[name][k], rig):
+            row = rig.camera[k] if unknown.per == "camera" else k
+            entry = unknown.describe_photograph(values[name][row], deviations[name][row], rig)
+            if entry and unknown.concerns(rig, bool(rig.lit[k])):
                 key, own[key], std[key] = entry
         photographs[capture.names[k]] = own | {"std": std}
     return {"refined": list(calibration.refined), "light": str(problem.lighting), "unknowns": unknowns,

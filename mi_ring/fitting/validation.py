@@ -23,7 +23,7 @@ from mi_ring.rendering.surface import Surface
 #: Of the pictures compared: width, for textures the least one [px]; samples per pixel; number.
 COMPARED_WIDTH, SPP, MOST = 256, 4, 16
 #: Options that are refined for single photographs, and so are unknown of those that are held out.
-PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.per == "photograph"}
+PER_PHOTOGRAPH = {unknown.option for unknown in UNKNOWNS.values() if unknown.single}
 
 
 def unexplained(problem: Problem, refined: Capture, surface: Surface, indirect: bool, width: int) -> float:

@@ -123,10 +123,12 @@ def measure(
 def received_by(capture: Capture, center: np.ndarray) -> np.ndarray:
     """Compute the irradiance (N,) at the object in each photograph, from the known lights, as a mean over colours.
 
-    `center` (3,): centre of the object [scene units]. If the lights are unknown, all values are 1.
+    `center` (3,): centre of the object [scene units]. If the lights are unknown, all values are 1. If those of some
+    photographs are unknown, these values are the median of the others.
     """
     received = capture.photographs.irradiance(center).mean(1)
-    return received if np.median(received) > 0 else np.ones_like(received)
+    usual = np.median(received[capture.photographs.mainly])
+    return np.where(received > 0, received, usual) if usual > 0 else np.ones_like(received)
 
 
 def units(capture: Capture, center: np.ndarray) -> str | None:

@@ -42,7 +42,8 @@ def evaluate(
     the numbers `aligned_…` describe this motion. None: no alignment.
 
     Numbers that end in `_input` are about fitted photographs, those in `_held_out` about held-out photographs, those in
-    `_novel` about `novel`. Two entries are no numbers: `views` and `novel_views` are lists of dicts, one dict for each
+    `_novel` about `novel`. Those in `_room_input` and `_room_held_out` are about photographs without a light of their
+    own, if others have one. Two entries are no numbers: `views` and `novel_views` are lists of dicts, one dict for each
     photograph. A number that is not defined, such as the genus of an open mesh, is missing.
     """
     if spp < 1:
@@ -75,9 +76,12 @@ def evaluate(
     numbers["inside_out"] = int(inside_out(ring, *ring.domain.sample(ring.subdivisions)).sum())
     record = read_json(run / "calibration.json")
     names = record["held_out"]["photographs"] if isinstance(record, dict) and "held_out" in record else []
-    for kind, held_out in (("input", False), ("held_out", True)):
-        index = [k for k, name in enumerate(capture.names) if (name in names) == held_out]
-        if index:
+    held_out = np.isin(capture.names, names)
+    dark = ~capture.photographs.lit & capture.photographs.mixed
+    kinds = {"input": ~held_out & ~dark, "held_out": held_out & ~dark, "room_input": ~held_out & dark,
+             "room_held_out": held_out & dark}  # fmt: skip
+    for kind, chosen in kinds.items():
+        if index := np.flatnonzero(chosen).tolist():
             predicted, photographs = compare_photographs(capture, ring, spp, index)
             numbers |= {f"{key}_{kind}": value for key, value in predicted.items()}
             for k, photograph in zip(index, photographs):

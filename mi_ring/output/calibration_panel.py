@@ -111,7 +111,7 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     """
     moved = [entry["moved_px"] for entry in photographs.values()]
     power = np.array([entry["power"] for entry in photographs.values() if "power" in entry])
-    light = after.photographs.room if after.photographs.dark else None
+    light = None if after.photographs.lit.all() else after.photographs.room
     told = max(moved) > VISIBLE or len(power) or light is not None  # otherwise there is no second chart
     figure = new_figure(9 if told else 4.5, 3.4)
     plan, *others = figure.subplots(1, 2 if told else 1, squeeze=False)[0]

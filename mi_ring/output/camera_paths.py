@@ -1,7 +1,7 @@
 """Lists and renders the views of the command mi-ring render: the photographs of a scene, or the frames of a film."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -135,7 +135,9 @@ def views_of(capture: Capture, ring: FittedObject, config: RenderConfig) -> list
     count = config.count
     if not count:
         names = [str(Path(name).with_suffix(f".{config.format}")) if config.format else name for name in capture.names]
-        several = zip(capture.shots, names, photographs_in(capture.scene), strict=True)
+        # A picture shows all light of the scene, also if a fit subtracts a part of it from the photograph.
+        shots = [replace(shot, files=shot.files._replace(ambient=None)) for shot in capture.shots]
+        several = zip(shots, names, photographs_in(capture.scene), strict=True)
         return [RenderedView(shot, name, config.time, sensor) for shot, name, sensor in several]
     if config.view is not None and config.view not in capture.names:
         first = capture.names[0]

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from mi_ring.capture.capture import Capture
@@ -73,6 +74,10 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     problems = [f"Problem: {line}" for line in found] or ["No problems found."]
     unit = "mm" if capture.shape.metres == 1e-3 else "scene units"
     place = "Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g}".format(*center, radius) + f" [{unit}]"
-    dark = capture.photographs.dark and capture.photographs.room is None
-    light = ["Light: the photographs have no light of their own; mi-ring fit --light auto finds it"] if dark else []
+    photographs, light = capture.photographs, []
+    if photographs.dark and capture.room is None:
+        light = ["Light: the photographs have no light of their own; mi-ring fit --light auto finds it"]
+    elif photographs.mixed:
+        dark = np.sum(~photographs.lit)
+        light = [f"Light: {dark} of {len(rows)} photographs have none of their own; a fit finds the room's in them"]
     return Inspection("\n".join([quality_table(rows), "", f"Masks: {masks}", place, *light, *problems]), found, page)

@@ -18,6 +18,7 @@ from skimage.registration import phase_cross_correlation
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
+from mi_ring.capture.pairs import camera_numbers
 from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.metrics.capture_findings import moved_far
 from mi_ring.metrics.image_errors import comparable
@@ -68,10 +69,10 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     surface = result.drawn(ring.subdivisions)
     some = list(capture.together(capture.spread(), TOGETHER))
     parts = pipelined(partial(predicted, result, surface), partial(panels_of, result, white(ring)), some)
-    panels = [panel for _, panel in sorted(zip(np.concatenate(some), chain(*parts)), key=lambda pair: pair[0])]
+    cameras = camera_numbers(capture)[shown := np.concatenate(some)]  # photographs of one are beside each other
+    panels = [panel for *_, panel in sorted(zip(cameras, shown, chain(*parts)), key=lambda entry: entry[:2])]
     rows = [row for row, _ in panels]
-    # All photographs on the page may be held-out ones.
-    fitted, errors = zip(*([panel for panel in panels if not panel[0].held_out] or panels))
+    fitted, errors = zip(*([panel for panel in panels if not panel[0].held_out] or panels))  # all may be held out
     masked = [row.iou for row in fitted if row.iou is not None]
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
@@ -113,8 +114,8 @@ def first_view(capture: Capture, ring: FittedObject) -> dict[str, list[float]]:
     `up`: up direction. `eye`: position of the first photograph's camera [scene units]. `irradiance`: RGB at the centre
     of the object, the median over the photographs; 1 if the photographs have no light of their own.
     """
-    eye = capture.shots[0].camera.position
-    irradiance = np.median(capture.photographs.irradiance(ring.center.cpu().numpy()), axis=0)
+    eye, received = capture.shots[0].camera.position, capture.photographs.irradiance(ring.center.cpu().numpy())
+    irradiance = np.median(received[capture.photographs.mainly], axis=0)
     if not irradiance.any():  # photographs have no lights of their own
         irradiance = np.ones(3)
     return {"up": capture.up.tolist(), "eye": eye.tolist(), "irradiance": irradiance.tolist()}

@@ -10,7 +10,13 @@ from PIL import Image, ImageDraw
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.reduction import whole_mask
-from mi_ring.capture.scenefile import at_level, fitted_scene_xml, recalibrated_xml, remasked_xml
+from mi_ring.capture.scenefile import (
+    at_level,
+    fitted_scene_xml,
+    recalibrated_xml,
+    remasked_xml,
+    with_missing_photographs,
+)
 from mi_ring.errors import InputError
 from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes, write_image
 from mi_ring.objects.fitted_object import FittedObject
@@ -105,10 +111,11 @@ def save(folder: Path, result: FitResult) -> None:
 def fitted_scene(capture: Capture, ring: FittedObject, folder: Path) -> bytes:
     """Make the content of scene.xml for the results in `folder`: the given scene with the fitted object.
 
-    Writes no file. The calibration stays as given. Paths are relative to `folder`. Raises InputError if the scene
-    cannot be rewritten.
+    Writes no file. Photographs of pairs that it lacks are added. The calibration stays as given. Paths are relative to
+    `folder`. Raises InputError if the scene cannot be rewritten.
     """
-    return fitted_scene_xml(capture.path, folder, ring.subdivisions, ring.bsdf)
+    scene = fitted_scene_xml(capture.path, folder, ring.subdivisions, ring.bsdf)
+    return with_missing_photographs(scene, capture.shots, folder)
 
 
 def write_log(folder: Path, entries: Iterable[dict]) -> None:
@@ -171,8 +178,8 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     if result.masks:
         scene = remasked_xml(scene, capture.shots, write_masks(folder / "masks", capture, result.masks))
     write_file(folder / "scene.xml", scene)
-    if capture.photographs.dark and capture.room is not None and not shared_emitters(capture.scene):
-        # The room is the only light.
+    if not capture.photographs.lit.all() and capture.room is not None and not shared_emitters(capture.scene):
+        # The room is the only light of photographs.
         radiance = room_envmap(capture.room, np.eye(4)).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
     print("Writing the report", flush=True)

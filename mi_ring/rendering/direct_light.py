@@ -9,14 +9,14 @@ from mi_ring.scene.lights import shared_emitters
 MIN_COSINE = 1e-3  #: the least cosine between viewer and normal; smaller ones are clamped: see `CookTorrance`
 
 
-def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
+def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None, shared=None):
     """Compute the radiance (Color3f) that the surface interactions `si` send to the viewer by direct light.
 
     The result is attached (it carries gradients). `light`: function from `si` to (DirectionSample3f, intensity /
     distance²) of the photograph's own light; None: it has none. `next_2d`: function that returns random points; each
     emitter of the scene that lights all photographs gets one. `shadows`: the own light casts shadows; the other
     emitters always do. `rooms`: also sample `room` emitters. `room_radiance`: function from `si` to radiance that is
-    added; None: nothing is added.
+    added; None: nothing is added. `shared`: factor of all light but the own light, one for each of `si`; None: 1.
     """
     context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
     # At an outline interpolated normals turn away before the faces do. A black strip there would be another edge.
@@ -31,12 +31,13 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None):
         return dr.select(lit, value * weight, 0)
 
     radiance = reflected(*light(si), shadows) if light else dr.zeros(mi.Color3f, dr.width(si.t))
+    factor = 1 if shared is None else shared
     if room_radiance:
-        radiance += dr.select(active, room_radiance(si), 0)
+        radiance += dr.select(active, factor * room_radiance(si), 0)
     for emitter in shared_emitters(scene, rooms):
-        radiance += reflected(*emitter.sample_direction(si, next_2d(), active), True)
+        radiance += factor * reflected(*emitter.sample_direction(si, next_2d(), active), True)
         if emitter.is_environment():
-            radiance += dr.select(active, 0, emitter.eval(si, ~active))
+            radiance += dr.select(active, 0, factor * emitter.eval(si, ~active))
     return radiance
 
 
@@ -79,5 +80,6 @@ def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
     dr.eval(hit)  # one traversal serves the image and its gradient
     si = hit.compute_surface_interaction(ray, active=active)
     room_radiance = photographs.room_radiance(scene, view)
-    radiance = shade(scene, si, photographs.lighting(view), next_2d, shadows, room_radiance=room_radiance)
+    radiance = shade(scene, si, photographs.lighting(view), next_2d, shadows, room_radiance=room_radiance,
+                     shared=photographs.shared(view))  # fmt: skip
     return [*radiance, dr.select(si.is_valid(), mi.Float(1), 0)]

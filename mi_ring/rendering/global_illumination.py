@@ -28,7 +28,9 @@ class GlobalIllumination:
 
     radiance: Tensor  #: (N, h, w, 3) of interreflection
     harmonics: list[int]  #: of `mi_ring.rendering.spherical_harmonics`, n of them
-    transfer: Tensor  #: (n, N, h, w, 3) radiance in a room whose radiance is one of these harmonics
+    #: (n, N, h, w, 3) radiance in a room whose radiance is one of these harmonics; 0 if the room's light does not reach
+    #: a photograph
+    transfer: Tensor
     unoccluded: Tensor  #: (n, N, h, w, 3) `transfer` as if nothing hid the room from the surface: once reflected light
     alpha: Tensor  #: (N, h, w) coverage
     coverage: Tensor  #: (N, H, W) coverage in the large pictures
@@ -57,6 +59,10 @@ class GlobalIllumination:
         *rgb, alpha = (channel.reshape(small.shape) for channel in channels[:4])
         basis = channels[4:] or [alpha.new_zeros(0)]
         transfer, unoccluded = torch.cat(basis).reshape(2, len(harmonics), 3, *small.shape).movedim(2, -1)
+        reached = photographs.in_room[np.array(photographs.index)]
+        if not reached.all():
+            transfer, unoccluded = (part * torch.from_numpy(reached).to(part)[:, None, None, None]
+                                    for part in (transfer, unoccluded))  # fmt: skip
         return cls(torch.stack(rgb, -1), list(harmonics), transfer, unoccluded, alpha, coverage, factor)
 
     @property

@@ -69,7 +69,7 @@ def trace_paths(scene, si, view, photographs, bounces, random, table=None, known
     is_known, blocked = mi.Bool(False), (mi.Color3f(0), mi.Vector3f(0, 0, 1))
     for bsdf in known:
         is_known |= si.bsdf() == mi.BSDFPtr(bsdf)
-    lighting = photographs.lighting(view)
+    lighting, shared = photographs.lighting(view), photographs.shared(view)
     for bounce in range(bounces):
         sample, weight = si.bsdf().sample(context, si, random().x, random(), active)
         throughput = dr.select(active, throughput * weight, 0)
@@ -88,7 +88,7 @@ def trace_paths(scene, si, view, photographs, bounces, random, table=None, known
         escaped, direction = dr.select(leaves, throughput, escaped), dr.select(leaves, out.d, direction)
         active = si.is_valid()
         # Paths that leave toward an environment add nothing: `shade` has its light at each surface.
-        lit = shade(scene, si, lighting, random, True)
+        lit = shade(scene, si, lighting, random, True, shared=shared)
         radiance += dr.select(active, throughput * lit, 0)
     return radiance, (escaped, direction), blocked
 

@@ -28,7 +28,7 @@ class Lights:
     def of(cls, shots: Sequence[Shot]) -> "Lights":
         """Collect the own lights of photographs. One without a light gets a point light of intensity 1 at its camera.
 
-        Raises SceneError if a light has infinite or negative values, or if some lights are black but not all.
+        Raises SceneError if a light has infinite or negative values.
         """
         lights = [shot.own_light for shot in shots]
         finite = np.array([light.kind == "point" for light in lights])
@@ -38,13 +38,9 @@ class Lights:
         for shot, place, rgb in zip(shots, places, strengths):
             what = f'photograph "{shot.name}": its light is'
             if not (np.isfinite(rgb) & (rgb >= 0)).all():
-                raise SceneError(f"{what} {rgb} strong, must be positive, or 0 in all")
+                raise SceneError(f"{what} {rgb} strong, must be positive, or 0 for none")
             if not np.isfinite(place).all():
                 raise SceneError(f"{what} at {place}, must be finite")
-        lit = strengths.any(1)
-        if lit.any() and not lit.all():
-            name = shots[int(lit.argmin())].name
-            raise SceneError(f'photograph "{name}": its light is 0 strong, must be positive, or 0 in all photographs')
         return cls(to_flat(mi.Float, places), mi.Bool(finite), to_flat(mi.Float, strengths))
 
     @classmethod

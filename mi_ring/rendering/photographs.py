@@ -30,9 +30,10 @@ class Photographs:
     index: object  #: UInt32: the selected photographs in their order
     size: tuple[int, int]  #: (width, height) [px] of every selected photograph
     colocated: bool  #: is every light at its camera's centre? Then the camera sees no shadows
+    lit: np.ndarray  #: (P,) bool, one per photograph: has it a light of its own? Others have one that is black
+    in_room: np.ndarray  #: (P,) bool, one per photograph: does light reach it that lights all photographs?
     #: Light of the room, (BASIS, 3) in `mi_ring.rendering.spherical_harmonics`; None if there is none.
     room: np.ndarray | None = None
-    dark: bool = False  #: are all lights of the photographs black?
     before: int = 0  #: number of photographs before these that are rendered elsewhere: random numbers depend on it
 
     @classmethod
@@ -47,14 +48,19 @@ class Photographs:
         eyes = views.cameras[:, :, 3]
         # Equal but for the rounding of float32.
         off = np.abs(views.places - eyes).max(1) > 1e-6 * np.abs(eyes).max()
+        lit = lights.rgb().any(1)
+        apart = (off | ~lights.is_finite())[lit if lit.any() else slice(None)]
         return cls(
-            views.buffers(), lights.finite, dr.arange(mi.UInt32, len(shots)), shots[0].size,
-            not (off | ~lights.is_finite()).any(), room, dark=not lights.rgb().any(),
+            views.buffers(), lights.finite, dr.arange(mi.UInt32, len(shots)), shots[0].size, not apart.any(), lit,
+            np.array([shot.in_room for shot in shots]), room,
         )  # fmt: skip
 
     @classmethod
     def attached(cls, sensor) -> "Photographs":
-        """Make the buffers of one `photograph` sensor. They carry gradients of the parameters of sensor and light."""
+        """Make the buffers of one `photograph` sensor. They carry gradients of the parameters of sensor and light.
+
+        All light of the scene reaches it, as in Mitsuba, also if a fit subtracts a part of it.
+        """
         m = sensor.to_world.matrix
         light = Lights.attached(sensor.light)
         views = Views(
@@ -62,7 +68,7 @@ class Photographs:
             dr.concat([*sensor.focal, *sensor.centre]), light.places, light.strengths, dr.concat([*sensor.cone]),
             mi.Float(sensor.distortion),
         )  # fmt: skip
-        return replace(cls.of([sensor.shot]), views=views)
+        return replace(cls.of([sensor.shot]), views=views, in_room=np.array([True]))
 
     def select(self, index: Sequence[int] | np.ndarray, size: tuple[int, int], scale: int = 1) -> "Photographs":
         """Return a copy with another selection of photographs, and another size of the pictures.
@@ -137,6 +143,21 @@ class Photographs:
         return ds, radiance
 
     @property
+    def dark(self) -> bool:
+        """True if no photograph has a light of its own."""
+        return not self.lit.any()
+
+    @property
+    def mixed(self) -> bool:
+        """True if some photographs have a light of their own, and others do not."""
+        return bool(self.lit.any() and not self.lit.all())
+
+    @property
+    def mainly(self) -> np.ndarray:
+        """Indices of the photographs that have a light of their own; of all photographs if none has."""
+        return np.flatnonzero(self.lit | self.dark)
+
+    @property
     def casts_shadows(self) -> bool:
         """True if the photographs' own lights cast shadows that cameras can see.
 
@@ -156,6 +177,15 @@ class Photographs:
         light). Returns None instead of a function if all lights are black.
         """
         return None if self.dark else lambda si: self.light(view, si)
+
+    def shared(self, view):
+        """Return a factor (Float) of the light that lights all photographs: 0 in those that it does not reach, else 1.
+
+        `view`: photograph of each lane. Returns None if it reaches all photographs.
+        """
+        if self.in_room.all():
+            return None
+        return dr.gather(mi.Float, to_flat(mi.Float, self.in_room), dr.gather(mi.UInt32, self.index, view))
 
     def room_radiance(self, scene, view):
         """Return a function from surface interactions to the room light (Color3f) that they reflect to the viewer.
@@ -177,11 +207,11 @@ class Photographs:
     def irradiance(self, point: np.ndarray) -> np.ndarray:
         """Compute the RGB irradiance (N, 3) by each photograph's light at `point` (3,), on a surface that faces it.
 
-        If the photographs have no lights of their own, it is the mean irradiance by the room light.
+        For a photograph without a light of its own, it is the mean irradiance by the room light.
         """
         own = self.lights.irradiance(point)
-        if self.dark and self.room is not None:
-            own = own + math.pi * self.room[0] / math.sqrt(4 * math.pi)
+        if self.room is not None:
+            own[~self.lit] += math.pi * self.room[0] / math.sqrt(4 * math.pi)
         return own
 
     @property

@@ -136,6 +136,11 @@ class Shot:
         """The photograph's `light`. If `light` is None: a point light of intensity 1 at the camera."""
         return self.light or Light("point", self.camera.position, np.ones(3))
 
+    @property
+    def in_room(self) -> bool:
+        """True if the light of the room is in the photograph. It is not if it was subtracted, see `Files.ambient`."""
+        return self.files.ambient is None
+
     def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> "Shot":
         """Return a copy with camera and light in another frame: a point x becomes scale · rotation · x + shift.
 

@@ -100,8 +100,8 @@ class SynthesizeConfig:
     """How the light of --room depends on the direction.
     constant: the same from all sides. harmonics: stronger from some sides, by spherical harmonics of order 2."""
     pairs: bool = False
-    """Render each view a second time, under the light of --room alone. A fit subtracts these second photographs.
-    The scene file names them as `ambient`."""
+    """Render each view a second time, under the light of --room alone. The scene file names these second photographs as
+    `ambient`. A fit subtracts them from the others."""
     environment: Path | None = None
     """EXR or HDR file of an environment map (latitude, longitude). It replaces the lights of --light and --room."""
     table: Literal["none", "plain", "sheet"] = "none"

@@ -21,7 +21,7 @@ from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image, to_bytes, write_image
-from mi_ring.rendering.spherical_harmonics import room_envmap
+from mi_ring.rendering.spherical_harmonics import BASIS, room_envmap
 from mi_ring.scene.lights import Light
 from mi_ring.scene.shot import Files, Response, Shot
 from mi_ring.scene.xml_elements import load_element
@@ -251,6 +251,8 @@ def write_scenes(
         emitters = scenefile.room_elements(exposure * studio.room_level * studio.room)
     for lamp in studio.further_lamps((seen + novel)[0].light):
         emitters.append(scenefile.emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
+    # For pairs the room is unknown, but not that it stood still while the object turned.
+    turning = scenefile.room_elements(np.zeros((BASIS, 3)), {"camera"}) if config.cameras == "turntable" else []
     up, ground = (config.up_axis, studio.ground) if config.table != "none" else (None, None)
     metres = 0.001 if config.table == "sheet" else None
 
@@ -274,7 +276,7 @@ def write_scenes(
                 shots = [replace(shot, light=shot.own_light._replace(vector=p.light.vector))
                          for shot, p in zip(shots, photographs)]  # fmt: skip
         root = scenefile.scene_element(map(scenefile.photograph_element, shots), ground=ground, up=up, metres=metres)
-        root.extend([] if paired or (config.wrong_room and not exact) else deepcopy(emitters))
+        root.extend(turning if paired else [] if config.wrong_room and not exact else deepcopy(emitters))
         root.extend(deepcopy(studio.tables))
         move_names(root, out, folder)
         return scenefile.scene_bytes(root)
