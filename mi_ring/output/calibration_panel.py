@@ -126,7 +126,7 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     for bars in others:
         if light is not None:
             frame = "camera" if light[PER_FRAME:].any() else "world"
-            radiance = room_envmap(light, np.eye(4)).clip(min=0)
+            radiance = room_envmap(light, np.eye(4), lobes=after.lobes).clip(min=0)
             bars.imshow(linear_to_srgb(radiance / max(float(radiance.max()), 1e-9)))
             bars.axis("off")
             bars.set_title(f"the environment, by longitude and latitude, y of the {frame} up", fontsize=9)

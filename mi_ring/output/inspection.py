@@ -73,6 +73,6 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     problems = [f"Problem: {line}" for line in found] or ["No problems found."]
     unit = "mm" if capture.shape.metres == 1e-3 else "scene units"
     place = "Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g}".format(*center, radius) + f" [{unit}]"
-    dark = capture.photographs.dark and capture.photographs.room is None
+    dark = capture.photographs.dark and not capture.photographs.harmonics
     light = ["Light: the photographs have no light of their own; mi-ring fit --light auto finds it"] if dark else []
     return Inspection("\n".join([quality_table(rows), "", f"Masks: {masks}", place, *light, *problems]), found, page)

@@ -8,11 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.rendering.lobe_light import LobeLight
 from mi_ring.rendering.photograph_lights import Lights, flash_falloff
 from mi_ring.rendering.pinhole import Pinhole
-from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes, reflected_harmonics
+from mi_ring.rendering.spherical_harmonics import BASIS, bsdfs_with_lobes, reflected_harmonics
 from mi_ring.rendering.views import Views
 from mi_ring.scene.alignment import to_flat
+from mi_ring.scene.lobes import Lobes
 from mi_ring.scene.shot import Shot
 
 LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
@@ -32,12 +34,15 @@ class Photographs:
     colocated: bool  #: is every light at its camera's centre? Then the camera sees no shadows
     #: Light of the room, (BASIS, 3) in `mi_ring.rendering.spherical_harmonics`; None if there is none.
     room: np.ndarray | None = None
+    lobes: LobeLight | None = None  #: small lights of the room; None if there are none
     dark: bool = False  #: are all lights of the photographs black?
     before: int = 0  #: number of photographs before these that are rendered elsewhere: random numbers depend on it
 
     @classmethod
-    def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None) -> "Photographs":
+    def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None, lobes: Lobes | None = None) -> "Photographs":
         """Collect cameras and lights of photographs. All are selected. `room` (BASIS, 3): room light; None: none.
+
+        `lobes`: small lights of the room.
 
         `size` becomes that of the first photograph. If photographs have several sizes, select those of one size before
         rendering. Raises SceneError if a light is invalid.
@@ -49,7 +54,7 @@ class Photographs:
         off = np.abs(views.places - eyes).max(1) > 1e-6 * np.abs(eyes).max()
         return cls(
             views.buffers(), lights.finite, dr.arange(mi.UInt32, len(shots)), shots[0].size,
-            not (off | ~lights.is_finite()).any(), room, dark=not lights.rgb().any(),
+            not (off | ~lights.is_finite()).any(), room, LobeLight.of(lobes), not lights.rgb().any(),
         )  # fmt: skip
 
     @classmethod
@@ -146,8 +151,15 @@ class Photographs:
 
     @property
     def harmonics(self) -> list[int]:
-        """Indices of the room's spherical harmonics whose coefficients are not 0."""
-        return [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
+        """Indices of the rows of `room_strengths` that are not 0, and of all lobes."""
+        used = [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
+        return used + [BASIS + j for j in range(len(self.lobes or ()))]
+
+    @property
+    def room_strengths(self) -> np.ndarray:
+        """Room light (BASIS + L, 3): the coefficients of spherical harmonics, then the fluxes of L lobes."""
+        room = np.zeros((BASIS, 3)) if self.room is None else self.room
+        return room if self.lobes is None else np.concatenate([room, self.lobes.flux])
 
     def lighting(self, view):
         """Return a function of surface interactions that computes the own light of photograph `view` there.
@@ -158,18 +170,23 @@ class Photographs:
         return None if self.dark else lambda si: self.light(view, si)
 
     def room_radiance(self, scene, view):
-        """Return a function from surface interactions to the room light (Color3f) that they reflect to the viewer.
+        """Return a function that computes the room light (Color3f) that surface interactions reflect to the viewer.
 
-        It assumes that nothing blocks the room light. Its result carries gradients. Returns None if there is no room
-        light. `view`: photograph of each lane, for room light that is fixed to the camera.
+        Its arguments are the interactions, and a function that returns random points. It assumes that nothing blocks
+        the harmonics of the room light; lobes cast shadows. Its result carries gradients. Returns None if there is no
+        room light. `view`: photograph of each lane, for room light that is fixed to the camera.
         """
         which = self.harmonics
         if not which:
             return None
 
-        def radiance(si):
-            buffer = to_flat(mi.Float, self.room[which])
-            values = reflected_harmonics(bsdfs_with_lobes(scene), si, self.camera(view).to_world, which)
+        def radiance(si, random):
+            buffer = to_flat(mi.Float, self.room_strengths[which])
+            bsdfs, pose = bsdfs_with_lobes(scene), self.camera(view).to_world
+            smooth = [k for k in which if k < BASIS]
+            values = reflected_harmonics(bsdfs, si, pose, smooth) if smooth else []
+            if self.lobes is not None:
+                values += self.lobes.reflected(scene, bsdfs, si, pose, random, si.is_valid())
             return sum((value * dr.gather(mi.Color3f, buffer, n) for n, value in enumerate(values)), mi.Color3f(0))
 
         return radiance
@@ -182,6 +199,8 @@ class Photographs:
         own = self.lights.irradiance(point)
         if self.dark and self.room is not None:
             own = own + math.pi * self.room[0] / math.sqrt(4 * math.pi)
+        if self.dark and self.lobes is not None:
+            own = own + self.lobes.flux.sum(0) / 4
         return own
 
     @property
