@@ -22,8 +22,8 @@ from mi_ring.image_headers import SUFFIXES
 from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.spherical_harmonics import room_of
-from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.lobes import lobes_of
+from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.shot import Shot
 from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.scene.xml_elements import require_parts

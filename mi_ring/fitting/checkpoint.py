@@ -6,8 +6,8 @@ from pathlib import Path
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import WEIGHTS, Config
-from mi_ring.fitting.setting_types import as_typed
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.setting_types import as_typed
 from mi_ring.fitting.start import StateError
 from mi_ring.objects.ring_file import read_state
 from mi_ring.system.files import digest, is_sealed, relative_to, write_state
@@ -15,7 +15,7 @@ from mi_ring.version import __version__
 
 NAME = "checkpoint.pt"
 BEFORE = "checkpoint.before.pt"  #: the previous checkpoint, in case the newest is damaged
-FORMAT = 7  #: of checkpoints; others are refused
+FORMAT = 8  #: of checkpoints; others are refused
 ADVICE = "run without --resume to start anew"
 
 

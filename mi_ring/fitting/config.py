@@ -84,6 +84,9 @@ class Common:
     texture: colour and gloss, and at the end a texture from the photographs at their own size.
     shape: displacement of the surface. both: texture and shape.
     none: neither, which takes less time."""
+    lobes: int = 32
+    """Largest number of small lights that the fit finds in an unknown room, such as windows, lamps and the sun, 0 to 32.
+    Only if the room is the only light. The fit finds as many as the photographs show. 0: only smooth light."""
     holdout: int = 0
     """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.
     For example, 8 leaves out the fifth, the thirteenth, and so on. The fit then has fewer photographs.
@@ -233,6 +236,7 @@ class Config(Ablation, Tuning, Common):
         for name in ("learning_rate", "muon_rate", "decay", "velocity_decay", "detail_rate"):
             require(0 < getattr(self, name) < math.inf, name, "above 0")
         require(0 <= self.detail_share < math.inf, "detail_share", "0 or more")
+        require(0 <= self.lobes <= 32, "lobes", "0 to 32")
         require(self.holdout == 0 or self.holdout >= 2, "holdout", "0, or 2 or more")
         require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
         require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")

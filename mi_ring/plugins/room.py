@@ -68,9 +68,9 @@ class Room(InvisibleEmitter):
         lobes = number_list(props, "lobes", range(0, 7 * MOST_LOBES + 1, 7)) if "lobes" in props else []
         for k, (*toward, sharpness, red, green, blue) in enumerate(np.reshape(lobes, (-1, 7)).tolist()):
             if not (any(toward) and LEAST_SHARPNESS <= sharpness <= LARGEST_SHARPNESS and min(red, green, blue) >= 0):
-                raise ValueError(f'room "{props.id()}": lobes: the direction of lobe {k} is {toward}, must not be 0; '
-                                 f"its sharpness is {sharpness:g}, must be {LEAST_SHARPNESS:g} to "
-                                 f"{LARGEST_SHARPNESS:g}; its colour is {[red, green, blue]}, must not be negative")  # fmt: skip
+                raise ValueError(f'room "{props.id()}": lobes: of lobe {k} the direction is {toward}, must not be 0; the '
+                                 f"sharpness is {sharpness:g}, must be {LEAST_SHARPNESS:g} to {LARGEST_SHARPNESS:g}; "
+                                 f"the colour is {[red, green, blue]}, must not be negative")  # fmt: skip
         self.lobes = mi.Float(lobes)
 
     @property
@@ -84,7 +84,7 @@ class Room(InvisibleEmitter):
         return dr.normalize(mi.Vector3f(x, y, z)), sharpness, mi.Color3f(colour)
 
     def shares(self) -> np.ndarray:
-        """Return the probabilities (1 + number of lobes,) with which a direction is drawn uniformly, or of each lobe."""
+        """Return the probabilities (1 + L,) with which a direction is drawn uniformly, or of each of L lobes."""
         lobes = np.array(dr.detach(self.lobes), float).reshape(-1, 7)
         even = np.linalg.norm(np.array(dr.detach(self.harmonics), float)) * math.sqrt(4 * math.pi / 3)
         light = np.array([even, *(lobes[:, 4:].mean(1) * solid_angle(lobes[:, 3]))])

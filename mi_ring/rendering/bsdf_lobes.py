@@ -100,19 +100,19 @@ def legendre(x, order):
 
 
 def zonal_coefficients(sharpness, order):
-    """Compute the mean Legendre polynomials of a von Mises–Fisher distribution about its axis, for degrees 0 to `order`.
+    """Compute the mean Legendre polynomials of a von Mises–Fisher distribution about its axis.
 
-    `sharpness` (n,): κ of the density in proportion to exp(κ cos θ). Returns (order + 1, n). They are ratios of modified
-    spherical Bessel functions, by the recurrence downward, which is stable ("Handbook of Mathematical Functions",
-    Abramowitz and Stegun 1964, 10.2.18).
+    `sharpness` (n,): κ of the density in proportion to exp(κ cos θ). `order`: at least 1. Returns (order + 1, n), for
+    degrees 0 to `order`. They are ratios of modified spherical Bessel functions, by the recurrence downward, which is
+    stable ("Handbook of Mathematical Functions", Abramowitz and Stegun 1964, 10.2.18).
     """
     k = np.maximum(np.asarray(sharpness, float), 1e-12)
-    half = (order + 1.5) / k
-    ratio, ratios = 1 / (half + np.hypot(1, half)), []
-    for degree in range(order, 0, -1):
+    first = order + 16 + int(6 * np.sqrt(k.max()))  # the first ratio is a bound, whose error has gone after these steps
+    ratio, ratios = k / (first + 1 + np.hypot(k, first + 2)), []
+    for degree in range(first, 0, -1):
         ratio = 1 / ((2 * degree + 1) / k + ratio)
         ratios.append(ratio)
-    return np.cumprod([np.ones_like(k), *reversed(ratios)], axis=0)
+    return np.cumprod([np.ones_like(k), *reversed(ratios[-order:])], axis=0)
 
 
 @functools.lru_cache(maxsize=4)
@@ -148,9 +148,10 @@ def widened_roughness(r, sharpness, cosine, distribution):
 
     `r`: roughness of the surface. `sharpness`: κ of the lobe. `cosine`: between viewer and half vector. A lobe is close
     to a Gaussian of variance 1 / κ along each axis. So its half vectors vary by s² = 1 / (4 κ o·h), which is the
-    geometric mean of both axes. Beckmann's distribution is a Gaussian of slopes of variance r² / 2, so r² grows by 2 s².
+    geometric mean of both axes. Beckmann's distribution is a Gaussian of slopes of variance r² / 2: r² grows by 2 s².
     For GGX the roughness is chosen so that the peak of the convolution has the right height. It contains the exponential
-    integral, here by the rational function in "Handbook of Mathematical Functions" (Abramowitz and Stegun 1964, 5.1.54).
+    integral, here by the rational function in "Handbook of Mathematical Functions" (Abramowitz and Stegun 1964,
+    5.1.54).
     """
     twice = 1 / (2 * sharpness * dr.maximum(cosine, MIN_COSINE))
     if distribution == "beckmann":

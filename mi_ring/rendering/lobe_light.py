@@ -45,23 +45,11 @@ class LobeLight:
     def reflected(self, scene, bsdfs: Collection, si, to_world, random, active=True) -> list:
         """Compute the radiance that surface interactions reflect to the viewer by each lobe, if its flux is 1.
 
-        Returns a Color3f for each lobe. `bsdfs`: BSDFs with a method `reflected_lobe`, which computes the unblocked
-        light in closed form; it carries gradients. This is multiplied by the visibility of one random direction of the
-        lobe, without gradients. For other BSDFs, the light from this direction alone is computed. `random`: function
-        that returns random points.
+        Returns a Color3f for each lobe. See `reflected_lobe`. `to_world`: pose of the camera of each lane.
         """
         result = []
         for j in range(len(self)):
-            direction, sharpness = self.lobe(j, to_world)
-            ds, visible = self.shadow(scene, si, direction, sharpness, random, active)
-            known, value = mi.Bool(False), mi.Color3f(0)
-            for bsdf in bsdfs:
-                own = si.bsdf() == mi.BSDFPtr(bsdf)
-                known |= own
-                value += dr.select(own, bsdf.reflected_lobe(si, direction, sharpness, visible & own), 0)
-            other = visible & ~known
-            value += dr.select(other, si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ds.d), other), 0)
-            result.append(dr.select(visible, value, 0))
+            result.append(reflected_lobe(scene, bsdfs, si, *self.lobe(j, to_world), random, active))
         return result
 
     def bounced(self, scene, si, to_world, random, active) -> tuple:
@@ -81,22 +69,40 @@ class LobeLight:
         lit &= light_visible(scene, si, ds, lit)
         return j, dr.select(lit, value * count, 0)
 
-    @staticmethod
-    def shadow(scene, si, direction, sharpness, random, active):
-        """Draw a direction of a lobe above the surface. Returns (DirectionSample3f, mask: is nothing in the way?).
 
-        What the surface's own horizon hides is part of the closed form. Of several directions one is drawn in proportion
-        to the irradiance ("Importance Resampling for Global Illumination", Talbot, Cline and Egbert 2005).
-        """
-        direction, sharpness, n = dr.detach(direction), dr.detach(sharpness), dr.detach(si.n)
-        drawn, total = direction, mi.Float(0)
-        for _ in range(CANDIDATES):
-            candidate = sample_lobe(direction, sharpness, random())
-            weight = dr.maximum(dr.dot(n, candidate), 0)
-            total += weight
-            drawn = dr.select(random().x * total < weight, candidate, drawn)
-        ds = at_distance(si, drawn)
-        return ds, active & light_visible(scene, si, ds, active)
+def reflected_lobe(scene, bsdfs: Collection, si, direction, sharpness, random, active=True):
+    """Compute the radiance (Color3f) that surface interactions reflect to the viewer by a lobe of unit flux.
+
+    `bsdfs`: BSDFs with a method `reflected_lobe`, which computes the unblocked light in closed form; it carries
+    gradients. This is multiplied by the visibility of one random direction of the lobe, without gradients. For other
+    BSDFs, the light from this direction alone is computed. `random`: function that returns random points.
+    """
+    ds, visible = lobe_shadow(scene, si, direction, sharpness, random, active)
+    known, value = mi.Bool(False), mi.Color3f(0)
+    for bsdf in bsdfs:
+        own = si.bsdf() == mi.BSDFPtr(bsdf)
+        known |= own
+        value += dr.select(own, bsdf.reflected_lobe(si, direction, sharpness, visible & own), 0)
+    other = visible & ~known
+    value += dr.select(other, si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ds.d), other), 0)
+    return dr.select(visible, value, 0)
+
+
+def lobe_shadow(scene, si, direction, sharpness, random, active):
+    """Draw a direction of a lobe above the surface. Returns (DirectionSample3f, mask: is nothing in the way?).
+
+    What the surface's own horizon hides is part of the closed form. Of several directions one is drawn in proportion to
+    the irradiance ("Importance Resampling for Global Illumination", Talbot, Cline and Egbert 2005).
+    """
+    direction, sharpness, n = dr.detach(direction), dr.detach(sharpness), dr.detach(si.n)
+    drawn, total = direction, mi.Float(0)
+    for _ in range(CANDIDATES):
+        candidate = sample_lobe(direction, sharpness, random())
+        weight = dr.maximum(dr.dot(n, candidate), 0)
+        total += weight
+        drawn = dr.select(random().x * total < weight, candidate, drawn)
+    ds = at_distance(si, drawn)
+    return ds, active & light_visible(scene, si, ds, active)
 
 
 def at_distance(si, direction):
@@ -110,7 +116,8 @@ def at_distance(si, direction):
 def sample_lobe(direction, sharpness, sample):
     """Draw a unit vector of a von Mises–Fisher distribution.
 
-    See "Simulation of the von Mises Fisher distribution" (Wood 1994). `direction`: its mean direction. `sharpness`: κ. `sample`: random point (Point2f) in [0, 1)².
+    `direction`: its mean direction. `sharpness`: κ. `sample`: random point (Point2f) in [0, 1)². See "Simulation of the
+    von Mises Fisher distribution" (Wood 1994).
     """
     lower = dr.log(sample.x + (1 - sample.x) * dr.exp(-2 * sharpness)) / sharpness  # cos θ − 1
     lower = dr.clip(lower, -2, 0)
