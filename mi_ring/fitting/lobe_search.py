@@ -97,7 +97,7 @@ class LobeSearch:
         self.pictures = [self.picture(*lobe) for lobe in self.lobes]  #: (n, 3) of each lobe
 
     def compared(self, problem: Problem, calibration: Calibration, indirect: bool) -> tuple[Tensor, Tensor]:
-        """Render the harmonics at random pixels of the object. Returns (their pictures (n, J, 3), photographs (n, 3))."""
+        """Render harmonics at random pixels of the object. Returns (their pictures (n, J, 3), photographs (n, 3))."""
         capture, random = problem.capture, np.random.default_rng(self.seed)
         fitted = problem.fitted[evenly_spaced(len(problem.fitted), PHOTOGRAPHS)]
         basis, observed = [], []

@@ -166,10 +166,7 @@ class CookTorrance(mi.BSDF):
         facets, specular = self.microfacets(here.roughness), self.with_fresnel(here.specular, dr.dot(si.wi, h))
         # G with m = n: G only uses the side of m, and `front` tests the side.
         gloss = specular * facets.eval(h) * facets.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
-        beside = dr.dot(i, o) - i.z * o.z
-        back = beside / dr.select(beside > 0, dr.maximum(i.z, o.z), 1)
-        sigma = here.diffuse_roughness
-        matte = here.diffuse * (1 + sigma * back) / (1 + DARKER * sigma)
+        matte = here.diffuse * roughened(i, o, here.diffuse_roughness)
         value = matte * ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         value += gloss * ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         return dr.select(active & self.front(si, wo), value * i.z, 0)
@@ -206,19 +203,16 @@ class CookTorrance(mi.BSDF):
 
         The light is a von Mises–Fisher distribution about the unit vector `direction` (in the world), of this
         `sharpness`. The diffuse part is exact for a diffuse roughness of 0. The specular part is that of a directional
-        light on a rougher surface, which is exact for sharp lobes. Attached to all arguments.
+        light on a rougher surface. Both are exact for sharp lobes. Attached to all arguments.
         """
         here, wo = self.parameters(si, active), si.to_local(direction)
         active &= self.front(si, mi.Vector3f(0, 0, 1))
-        albedo, aside, along = rough_lobe(si.wi.z, here.diffuse_roughness)
-        # What roughness adds to Lambert's law is known to degree 1 in spherical harmonics.
-        more = mi.Vector3f(aside * si.wi.x, aside * si.wi.y, along - 2 / 3 * albedo)
-        mean = 1 / dr.tanh(sharpness) - 1 / sharpness
-        cosine = albedo * softened_cosine(wo.z, sharpness) + 0.75 * mean * dr.dot(more, wo)
+        i, o = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (wo, si.wi))
+        matte = here.diffuse * roughened(i, o, here.diffuse_roughness) * softened_cosine(wo.z, sharpness)
         h = dr.normalize(wo + si.wi)
         wide = widened_roughness(here.roughness, sharpness, dr.dot(si.wi, h), self.distribution)
         gloss = self.reflected(gloss_alone(), si, wo, here._replace(roughness=wide), active)
-        return dr.select(active, here.diffuse * dr.maximum(cosine, 0), 0) + gloss
+        return dr.select(active, dr.maximum(matte, 0), 0) + gloss
 
     def gloss_probability(self, ctx, si, here):
         """Compute the probability with which `sample` chooses the specular lobe: 4 ρᵞ / (π ρᵈ + 4 ρᵞ).
@@ -284,6 +278,13 @@ class CookTorrance(mi.BSDF):
     def to_string(self):
         inner = ", ".join(f"{name}={texture}" for name, texture in self.textures.items())
         return f"CookTorrance[distribution={self.distribution}, {inner}]"
+
+
+def roughened(i, o, sigma):
+    """Compute the factor of the diffuse reflectance by its roughness `sigma`, for light from `i`, seen from `o`."""
+    beside = dr.dot(i, o) - i.z * o.z
+    back = beside / dr.select(beside > 0, dr.maximum(i.z, o.z), 1)
+    return (1 + sigma * back) / (1 + DARKER * sigma)
 
 
 def gloss_alone():

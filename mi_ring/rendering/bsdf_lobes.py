@@ -148,10 +148,10 @@ def widened_roughness(r, sharpness, cosine, distribution):
 
     `r`: roughness of the surface. `sharpness`: κ of the lobe. `cosine`: between viewer and half vector. A lobe is close
     to a Gaussian of variance 1 / κ along each axis. So its half vectors vary by s² = 1 / (4 κ o·h), which is the
-    geometric mean of both axes. Beckmann's distribution is a Gaussian of slopes of variance r² / 2: r² grows by 2 s².
-    For GGX the roughness is chosen so that the peak of the convolution has the right height. It contains the exponential
-    integral, here by the rational function in "Handbook of Mathematical Functions" (Abramowitz and Stegun 1964,
-    5.1.54).
+    geometric mean of both axes. Beckmann's distribution is a Gaussian of slopes of variance r² / 2: r² grows by
+    2 s². For GGX the roughness is chosen so that the peak of the convolution has the right height. It contains the
+    exponential integral, here by the rational function in "Handbook of Mathematical Functions" (Abramowitz and Stegun
+    1964, 5.1.54).
     """
     twice = 1 / (2 * sharpness * dr.maximum(cosine, MIN_COSINE))
     if distribution == "beckmann":
