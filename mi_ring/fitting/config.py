@@ -84,9 +84,6 @@ class Common:
     texture: colour and gloss, and at the end a texture from the photographs at their own size.
     shape: displacement of the surface. both: texture and shape.
     none: neither, which takes less time."""
-    lobes: int = 32
-    """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
-    Only if the room is the only light. The fit finds as many as the photographs show. 0: only smooth light."""
     holdout: int = 0
     """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.
     For example, 8 leaves out the fifth, the thirteenth, and so on. The fit then has fewer photographs.
@@ -113,6 +110,9 @@ class Tuning:
     widths: tuple[int, ...] = (128, 256, 512)
     """Largest width of the photographs in each stage [px]: one number for each of --levels.
     The fit reduces wider photographs to this width. Larger widths give finer detail and take longer."""
+    lobes: int = 32
+    """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
+    Only if the room is the only light. The fit finds as many as the photographs show. 0: only smooth light."""
     shares: tuple[float, ...] = (0.45, 0.46, 0.09)
     """Iterations of each stage, from coarse to fine, as a share of all: one number above 0 for each of --levels.
     Only the ratios count. A larger last number gives finer detail and takes longer. A fit that starts from a hull or a

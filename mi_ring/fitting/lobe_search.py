@@ -125,7 +125,7 @@ class LobeSearch:
         """Render the pictures (n, D, 3) of lobes, weighted like the photographs."""
         parts = [candidate_pictures(self.surface, photographs, pixels, toward, sharpness, self.in_camera, self.seed)
                  for photographs, pixels in self.parts]  # fmt: skip
-        return torch.cat(parts) * self.weights[:, None, None]
+        return torch.from_numpy(np.concatenate(parts)) * self.weights[:, None, None]
 
     def picture(self, toward: np.ndarray, sharpness: float) -> Tensor:
         """Render the picture (n, 3) of one lobe, weighted like the photographs."""

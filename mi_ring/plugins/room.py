@@ -68,9 +68,11 @@ class Room(InvisibleEmitter):
         lobes = number_list(props, "lobes", range(0, 7 * MOST_LOBES + 1, 7)) if "lobes" in props else []
         for k, (*toward, sharpness, red, green, blue) in enumerate(np.reshape(lobes, (-1, 7)).tolist()):
             if not (any(toward) and LEAST_SHARPNESS <= sharpness <= LARGEST_SHARPNESS and min(red, green, blue) >= 0):
-                raise ValueError(f'room "{props.id()}": lobes: of lobe {k} the direction is {toward}, must not be 0; '
-                                 f"the sharpness is {sharpness:g}, must be {LEAST_SHARPNESS:g} to "
-                                 f"{LARGEST_SHARPNESS:g}; the colour is {[red, green, blue]}, must not be negative")  # fmt: skip
+                raise ValueError(
+                    f'room "{props.id()}": lobes: of lobe {k} the direction is {toward}, must not be 0; its sharpness '
+                    f"{sharpness:g}, must be {LEAST_SHARPNESS:g} to {LARGEST_SHARPNESS:g}; the colour is "
+                    f"{[red, green, blue]}, must not be negative"
+                )
         self.lobes = mi.Float(lobes)
 
     @property

@@ -3,10 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import torch
-from torch import Tensor
 
-from mi_ring.rendering.bridge import evaluated
 from mi_ring.rendering.direct_light import next_2d
 from mi_ring.rendering.lobe_light import reflected_lobe
 from mi_ring.rendering.photographs import LANES, Photographs, center_rays
@@ -15,11 +12,10 @@ from mi_ring.rendering.surface import Surface
 from mi_ring.scene.alignment import to_flat
 
 
-@torch.no_grad()
 def candidate_pictures(
     surface: Surface, photographs: Photographs, pixels: np.ndarray, toward: np.ndarray, sharpness: np.ndarray,
     in_camera: bool, seed: int,
-) -> Tensor:  # fmt: skip
+) -> np.ndarray:  # fmt: skip
     """Render pixels of photographs in the light of one lobe after the other. Returns linear radiance (n, D, 3).
 
     Each lobe has a flux of 1. Its light is reflected once, with shadows by one ray. It is that of the pixel's centre.
@@ -48,5 +44,6 @@ def candidate_pictures(
             value = reflected_lobe(
                 surface.scene, bsdfs, si, direction, dr.gather(mi.Float, sharp, one), random, si.is_valid()
             )
-            parts.append(torch.stack(evaluated([*value]), -1).reshape(-1, count, 3).cpu())
-    return torch.cat(parts)
+            dr.eval(value)
+            parts.append(np.array(value).T.reshape(-1, count, 3))
+    return np.concatenate(parts)
