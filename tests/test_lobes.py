@@ -297,7 +297,7 @@ def test_a_fit_moves_lobes_continues_with_them_and_writes_them(in_the_sun, tmp_p
     capture = mi_ring.load_capture(in_the_sun)
     config = mi_ring.Config.preset("fast", **TINY | {"iterations": 3}, light="environment")
     fit = mi_ring.Fit(capture, config, lighting=Lighting("environment"))
-    start = Lobes(unit(*(TOWARD + [0, 0, 0.18]))[None], np.array([40.0]), np.ones((1, 3)), np.array([False]))
+    start = Lobes(unit(*np.add(TOWARD, [0, 0, 0.18]))[None], np.array([40.0]), np.ones((1, 3)), np.array([False]))
     fit.model.calibration.room.place(start)
     fit.step()
     resumed = mi_ring.Fit(capture, config, state=fit.state())
