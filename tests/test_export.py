@@ -415,7 +415,7 @@ assert "mi_ring" not in sys.modules
 np.save({str(tmp_path / "stock.npy")!r}, np.array(picture)[..., :3])"""
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
     stock = np.load(tmp_path / "stock.npy")
-    shot, _ = mitsuba_scene.first_photograph(run)
+    shot, *_ = mitsuba_scene.first_photograph(run)
     matrix, (fx, fy), (cx, cy), *_ = shot.camera
     assert fx != fy and stock.shape == (round(40 * fx / fy), 56, 3)
     light = shot.light

@@ -24,12 +24,14 @@ from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import undistortion_factor
 from mi_ring.rendering import bridge, prediction
+from mi_ring.rendering.lobe_light import LobeLight
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.rendering.surface import Surface
 from mi_ring.rendering.views import Views
 from mi_ring.scene.assembly import with_lamps
 from mi_ring.scene.lights import shared_emitters
+from mi_ring.scene.lobes import Lobes
 from mi_ring.system.machine import device
 
 #: All options of `--refine` with values in a calibration, in order.
@@ -66,7 +68,8 @@ class Calibration(nn.Module):
         given = capture.room
         room = torch.zeros(BASIS, 3) if given is None else rig.power * torch.from_numpy(given).float()
         alone = not capture.photographs.lit.all() and not shared_emitters(capture.scene)
-        self.room = RoomLight(room, rig.exposure, frames, alone)
+        lobes = None if capture.lobes is None else capture.lobes.scaled(rig.power)
+        self.room = RoomLight(room, rig.exposure, frames, alone, lobes)
 
     def value(self, name: str) -> Tensor:
         """Return the current correction of one kind of calibration parameter, in the parameter's unit.
@@ -188,7 +191,8 @@ class Calibration(nn.Module):
         `views`: the new cameras and lights of all photographs. The result has no gradients.
         """
         room = self.room_harmonics().double().numpy(force=True)
-        return replace(prediction.with_views(photographs, views), room=room if room.any() else None)
+        lobes = LobeLight.of(self.room_lobes())
+        return replace(prediction.with_views(photographs, views), room=room if room.any() else None, lobes=lobes)
 
     def room_harmonics(self) -> Tensor:
         """Return the current spherical harmonics (BASIS, 3) of the room's light.
@@ -198,6 +202,14 @@ class Calibration(nn.Module):
         """
         harmonics = self.room.harmonics
         return harmonics if "ambient" in self.refined else harmonics / self.albedo_factor
+
+    def room_lobes(self) -> Lobes | None:
+        """Return the current lobes of the room's light; None if there are none.
+
+        If the room's light is not refined, those of the capture are multiplied by the common factor of all lights.
+        """
+        lobes = self.room.lobes()
+        return lobes if lobes is None or "ambient" in self.refined else lobes.scaled(1 / self.albedo_factor)
 
     @torch.no_grad()
     def room_share(self, harmonics: Tensor) -> Tensor:
@@ -237,7 +249,7 @@ class Calibration(nn.Module):
         Both are tensors in the unit of the parameter. The caller may change the current value in place.
         """
         if option == "ambient":
-            return [(self.room.harmonics, self.room.given)]
+            return self.room.current_and_given()
         own = [getattr(self, name) for name, unknown in self.unknowns.items() if unknown.option == option]
         return [(tensor, torch.zeros_like(tensor)) for tensor in own]
 
@@ -269,4 +281,5 @@ class Calibration(nn.Module):
             scene = with_lamps(scene, lamps._replace(strengths=level * lamps.strengths).lights())
         if "ambient" in self.refined or capture.room is not None:
             room = self.room_harmonics().double().numpy(force=True) * level
-        return replace(capture, scene=scene, shots=tuple(shots), room=room)
+        lobes = self.room_lobes()
+        return replace(capture, scene=scene, shots=tuple(shots), room=room, lobes=lobes and lobes.scaled(level))

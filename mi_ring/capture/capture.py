@@ -25,6 +25,7 @@ from mi_ring.plugins import shapenet
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import room_of
 from mi_ring.scene.lights import Light
+from mi_ring.scene.lobes import Lobes
 from mi_ring.scene.shot import Encoding, Files, Shot
 from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system import llvm
@@ -60,6 +61,7 @@ class Capture:
     images: Pixels = field(default_factory=Pixels)  #: encoded pixels (H, W, 3) uint8, uint16 or float32; see `observe`
     masks: Pixels = field(default_factory=Pixels)  #: (H, W) uint8, 0 background, 255 object
     valid: Pixels = field(default_factory=Pixels)  #: (H, W) uint8, 0 where the photograph shows nothing
+    lobes: Lobes | None = None  #: small lights of the room; None if there are none
     threshold: float | None = None  #: radiance above which pixels are in masks by brightness; None for given masks
     #: Cache of visual hulls, by masks and cameras. Captures that `replace` makes of this one share it.
     hulls: dict[Hashable, Hull | None] = field(default_factory=dict, repr=False)
@@ -144,7 +146,7 @@ class Capture:
                     arrays.write_array(pixels[k], file)
             relative.append(replace(shot, files=own))
             shots.append(replace(shot, files=files))
-        xml = recalibrated_xml(with_photographs(self.xml, relative), relative, self.room)
+        xml = recalibrated_xml(with_photographs(self.xml, relative), relative, self.room, lobes=self.lobes)
         write_file(path, xml)
         return replace(self, path=path, xml=xml, shots=tuple(shots))
 
@@ -154,7 +156,7 @@ class Capture:
 
         Raises SceneError if a light is not supported.
         """
-        return Photographs.of(self.shots, self.room)
+        return Photographs.of(self.shots, self.room, self.lobes)
 
     @functools.cached_property
     def sizes(self) -> dict[tuple[int, int], np.ndarray]:

@@ -23,6 +23,7 @@ from mi_ring.image_headers import SUFFIXES
 from mi_ring.plugins import photograph, shapenet
 from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.spherical_harmonics import room_of
+from mi_ring.scene.lobes import lobes_of
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.shot import Shot
 from mi_ring.scene.visibility import MaskedCamera
@@ -60,7 +61,7 @@ def load_capture(
     if len(shapes) != 1:
         raise InputError(f'{path}: shape: found {len(shapes)} <shape type="shapenet">; a fit needs exactly one')
     shadows = getattr(scene.integrator(), "shadows", True)
-    capture = Capture(path, path.read_bytes(), scene, shapes[0], shots, room_of(scene), shadows)
+    capture = Capture(path, path.read_bytes(), scene, shapes[0], shots, room_of(scene), shadows, lobes=lobes_of(scene))
     try:
         for shape in scene.shapes():
             require_attributes(shape)

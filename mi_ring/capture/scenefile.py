@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
-from mi_ring.rendering.spherical_harmonics import MAX_ORDER, PER_FRAME
+from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER, PER_FRAME
 from mi_ring.scene.lights import Light
+from mi_ring.scene.lobes import Lobes
 from mi_ring.scene.shot import Files, Shot
 from mi_ring.system.files import relative_to
 
@@ -165,14 +166,14 @@ def numbers(values: ArrayLike) -> str:
 
 def recalibrated_xml(
     scene: bytes, shots: Sequence[Shot], room: np.ndarray | None = None, frames: Collection[str] | None = None,
-    lamps: Iterable[Light] | None = None,
+    lamps: Iterable[Light] | None = None, lobes: Lobes | None = None,
 ) -> bytes:  # fmt: skip
     """Return new content for a scene file, with the cameras, lights and responses of `shots`. No file is written.
 
     `scene`: the old content. A shot replaces the photograph whose id is its name; without ids, the photograph at the
     same position. `room` (BASIS, 3): spherical harmonics of the room's light; None: none. `frames`: "world" and/or
     "camera"; light in these axes is written even if it is black; None: the axes that the old content has. `lamps`:
-    point and directional lights for all photographs; None: keep the old ones.
+    point and directional lights for all photographs; None: keep the old ones. `lobes`: small lights of the room.
     """
     root = ElementTree.fromstring(scene)
     for element, k in photographs_of(root, shots):
@@ -192,8 +193,9 @@ def recalibrated_xml(
         frame = emitter.find("string[@name='frame']")
         before.add("world" if frame is None else frame.get("value", ""))
         root.remove(emitter)
-    if room is not None:
-        root.extend(room_elements(room, before if frames is None else frames))
+    if room is not None or lobes is not None:
+        room = np.zeros((BASIS, 3)) if room is None else room
+        root.extend(room_elements(room, before if frames is None else frames, lobes))
     return scene_bytes(root)
 
 
@@ -257,30 +259,35 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
     return [(element, named.get(element.get("id", ""), k)) for k, element in enumerate(elements)]
 
 
-def room_elements(room: np.ndarray, frames: Collection[str] = ()) -> list[Element]:
+def room_elements(room: np.ndarray, frames: Collection[str] = (), lobes: Lobes | None = None) -> list[Element]:
     """Make the XML of room light: one element for light that is fixed in world axes, one for light in camera axes.
 
     `room` (BASIS, 3): spherical harmonics, first in world axes, then in camera axes. An element whose light is black is
-    left out, unless `frames` contains its axes, "world" or "camera".
+    left out, unless `frames` contains its axes, "world" or "camera". `lobes`: small lights, in either axes.
     """
     world, camera = room[:PER_FRAME], np.vstack([np.zeros_like(room[:1]), room[PER_FRAME:]])
     # Uniform light belongs to either part.
     if not world[1:].any() and (camera.any() or set(frames) == {"camera"}):
         world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[PER_FRAME:])])
     parts = {"world": world, "camera": camera}
-    return [room_element(frame, part) for frame, part in parts.items() if part.any() or frame in frames]
+    own = {frame: lobes and lobes.selected(lobes.in_camera == (frame == "camera")) for frame in parts}
+    return [room_element(frame, part, own[frame]) for frame, part in parts.items()
+            if part.any() or frame in frames or own[frame]]  # fmt: skip
 
 
-def room_element(frame: str, harmonics: np.ndarray) -> Element:
+def room_element(frame: str, harmonics: np.ndarray, lobes: Lobes | None = None) -> Element:
     """Make the XML of a `room` emitter: light from all around, in the axes `frame`, "world" or "camera".
 
-    `harmonics` (n, 3): real spherical harmonics of its radiance; n at most PER_FRAME.
+    `harmonics` (n, 3): real spherical harmonics of its radiance; n at most PER_FRAME. `lobes`: small lights in these
+    axes.
     """
     orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
     harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
     element = ElementTree.Element("emitter", type="room")
     ElementTree.SubElement(element, "string", name="frame", value=frame)
     ElementTree.SubElement(element, "string", name="harmonics", value=numbers(harmonics))
+    if lobes:
+        ElementTree.SubElement(element, "string", name="lobes", value=numbers(lobes.values()))
     return element
 
 

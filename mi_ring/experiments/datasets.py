@@ -227,7 +227,7 @@ class PerturbedCameras(Derived):
         for shot in root.findall("sensor"):
             for flag in shot.findall("boolean[@name='calibrated']"):
                 shot.remove(flag)
-        return recalibrated_xml(ElementTree.tostring(root), wrong, capture.room)
+        return recalibrated_xml(ElementTree.tostring(root), wrong, capture.room, lobes=capture.lobes)
 
 
 @dataclass(frozen=True)

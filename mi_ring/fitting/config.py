@@ -114,6 +114,9 @@ class Tuning:
     """Iterations of each stage, from coarse to fine, as a share of all: one number above 0 for each of --levels.
     Only the ratios count. A larger last number gives finer detail and takes longer. A fit that starts from a hull or a
     mesh skips two thirds of the iterations of the first stage. It adds 40 % of the skipped iterations to the second."""
+    small_lights: int = 0
+    """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
+    Only if the room is the only light. 0: the light is smooth. Give 8 if the light was small and the object is glossy."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
     A fit with --detail chooses the level itself, 7 or 8 for most captures.
@@ -237,6 +240,7 @@ class Config(Ablation, Tuning, Common):
         for name in ("learning_rate", "muon_rate", "decay", "velocity_decay", "detail_rate"):
             require(0 < getattr(self, name) < math.inf, name, "above 0")
         require(0 <= self.detail_share < math.inf, "detail_share", "0 or more")
+        require(0 <= self.small_lights <= 32, "small_lights", "0 to 32")
         require(self.holdout == 0 or self.holdout >= 2, "holdout", "0, or 2 or more")
         require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
         require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")

@@ -23,6 +23,7 @@ from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.rendering import prediction
 from mi_ring.rendering.global_illumination import GlobalIllumination
+from mi_ring.rendering.lobe_light import LobeLight
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.plain_mesh import POSITIONS
@@ -188,7 +189,9 @@ class CovarianceGroup:
         calibration, photographs = self.calibration, self.problem.capture.selected(self.index, self.scale)
         calibration.relight(self.surface)
         room = calibration.room_harmonics().cpu().double().numpy() if self.dark else None
-        return prediction.with_views(replace(photographs, room=room), calibration(self.scale).to(self.problem.device))
+        lobes = LobeLight.of(calibration.room_lobes()) if self.dark else None
+        lit = replace(photographs, room=room, lobes=lobes)
+        return prediction.with_views(lit, calibration(self.scale).to(self.problem.device))
 
     def direct(self) -> tuple[Tensor, Tensor]:
         """Render direct light.
@@ -196,7 +199,9 @@ class CovarianceGroup:
         Returns linear radiance (n, H, W, 3) and coverage (n, H, W), the object's share of each pixel.
         """
         shadows = self.problem.config.shadows and self.problem.capture.shadows
-        return prediction.draw(self.surface, self.photographs(), SPP, shadows=shadows, occlusion=False)
+        photographs = self.photographs()
+        photographs = photographs if photographs.dark else replace(photographs, lobes=None)
+        return prediction.draw(self.surface, photographs, SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Render interreflection and room light. Returns both as linear radiance (n, H, W, 3), and the transfer.
@@ -206,9 +211,9 @@ class CovarianceGroup:
         """
         calibration, indirect = self.calibration, self.indirect
         bounced, room_light, transfer = torch.zeros_like(lit), torch.zeros_like(lit), lit.new_zeros(0, *lit.shape)
-        room, unknown = calibration.room_harmonics(), "ambient" in calibration.refined
+        unknown, photographs = "ambient" in calibration.refined, self.photographs()
+        room = torch.cat([calibration.room_harmonics().cpu(), lobe_fluxes(photographs)])
         if indirect or room.any() or unknown:
-            photographs = self.photographs()
             around = GlobalIllumination.of(self.surface, photographs, coverage.to(self.problem.device), 1, paths=SPP,
                                          indirect=indirect, harmonics=calibration.room.which)  # fmt: skip
             bounced = around.interreflection.cpu() if indirect else bounced
@@ -237,6 +242,11 @@ class CovarianceGroup:
             moving = covering if unknown.name == POSITIONS else moving
             slopes += [slope * channel for channel in torch.eye(3)] if unknown.channels == 3 else [slope]
         return torch.stack(slopes), moving[None]
+
+
+def lobe_fluxes(photographs: Photographs) -> Tensor:
+    """Return the fluxes (n, 3) of the lobes of the room light."""
+    return torch.zeros(0, 3) if photographs.lobes is None else torch.from_numpy(photographs.lobes.flux).float()
 
 
 def compare(at: CovarianceGroup, layout: Layout, colours: Equations, silhouettes: Equations) -> None:

@@ -118,7 +118,7 @@ class Predictor:
 
     def of(self, shot: Shot) -> Expected:
         """Predict a photograph. A pixel is usable if it and its neighbours show only the object, lit, no highlight."""
-        photographs = Photographs.of([shot], self.refined.room)
+        photographs = Photographs.of([shot], self.refined.room, self.refined.lobes)
 
         def drawn() -> tuple[np.ndarray, np.ndarray]:
             rgb, coverage = prediction.draw(self.surface, photographs, 1, shadows=self.refined.shadows,

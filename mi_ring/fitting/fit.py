@@ -105,11 +105,11 @@ class Fit(Renamed):
         started = time.perf_counter()
         if "masks" in self.problem.config.refine and self.schedule.masks_due(self.iteration):
             self.refine_masks()
+        self.optimisation.find_lobes(self.renderer, self.schedule, self.iteration)
         batch = self.sampler.draw(self.problem, self.schedule, self.ring.domain, self.iteration)
         observation = self.sampler.observe(self.problem, self.capture, batch)
         it = self.optimisation.step(lambda: self.evaluate(batch, observation))
-        self.renderer.remember(it.prediction)
-        it.prediction = it.prediction.detached()
+        it.prediction = self.renderer.remember(it.prediction)
         self.regulariser.note(it)
         self.course.iteration += 1
         self.optimisation.prepare(self.schedule, self.iteration)

@@ -113,7 +113,7 @@ def require_compatible(capture: Capture, config: Config) -> None:
 
 def is_unlit(capture: Capture) -> bool:
     """Test whether a capture has no light at all: neither lights of photographs nor room light."""
-    return capture.photographs.dark and capture.room is None
+    return capture.photographs.dark and capture.room is None and capture.lobes is None
 
 
 def exposures(capture: Capture) -> np.ndarray:
@@ -167,7 +167,7 @@ def with_lighting(capture: Capture, lighting: Lighting) -> Capture:
     for shot, light, gain in zip(capture.shots, lights, gains):
         response = shot.response.changed(gain=gain)
         shots.append(replace(shot, light=light, falloff=0.0, tilt=(0.0, 0.0), response=response))
-    return replace(capture, scene=scene, shots=tuple(shots), room=room)
+    return replace(capture, scene=scene, shots=tuple(shots), room=room, lobes=None)
 
 
 def environment_as_harmonics(capture: Capture) -> tuple[Capture, Any, np.ndarray | None]:

@@ -15,18 +15,21 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import unfold
 from mi_ring.fitting.exposure_solver import ExposureSolver
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.lobe_search import find_lobes, finds_lobes
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.nan_guard import NanGuard
 from mi_ring.fitting.pose_solver import PoseSolver
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import START
+from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
 from mi_ring.fitting.terms import Term
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.machine import has_fast_bfloat16
 
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
+LOBE_TURN, LOBE_SHARPEN = 0.004, 0.03  #: Adam's learning rates for lobes: of directions [rad], of log sharpness
 TEXTURE_FACTOR = 3.0  #: longest step of a value of a texture, by the longest step of a displacement
 CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one makes it diverge
 
@@ -57,6 +60,15 @@ def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepp
         return []
     adam = torch.optim.Adam([{"params": group} for group in groups], lr=CALIBRATION_RATE)
     return [Stepper(adam, [Rate(CALIBRATION_RATE, config.decay, START)] * len(groups))]
+
+
+def lobe_steppers(calibration: Calibration, config: Config) -> list[Stepper]:
+    """Make the optimiser of directions and sharpness of the room's lobes. Returns [] if the fit does not find lobes."""
+    if not finds_lobes(calibration, config):
+        return []
+    room, rates = calibration.room, (LOBE_TURN, LOBE_SHARPEN)
+    adam = torch.optim.Adam([{"params": [room.toward]}, {"params": [room.log_sharpness]}])
+    return [Stepper(adam, [Rate(rate, config.decay) for rate in rates])]
 
 
 def detail_steppers(ring: FittedObject, config: Config) -> list[Stepper]:
@@ -108,7 +120,7 @@ class Optimisation:
                 self.solvers.append(BrightnessSolver(calibration))
             if "cameras" in calibration.refined:
                 self.solvers.append(PoseSolver(calibration, model.starts_near, self.terms))
-            self.steppers += calibration_steppers(calibration, config)
+            self.steppers += calibration_steppers(calibration, config) + lobe_steppers(calibration, config)
             self.steppers += [Stepper(solver, [solver.rate]) for solver in self.solvers]
         self.optimizers = [stepper.optimizer for stepper in self.steppers]
         self.guard = NanGuard(model, self.optimizers)
@@ -175,6 +187,20 @@ class Optimisation:
         if fixed and iteration == schedule.shaping and self.model.calibration:
             self.model.calibration.room.forget()
             self.guard.keep()  # so that a retreat does not restore the old equations
+
+    def find_lobes(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
+        """Find the lobes of the room's light anew, if it is time. `iteration`: the next one, from 0."""
+        calibration, problem = self.model.calibration, self.problem
+        if calibration is None or self.model.detailed or not finds_lobes(calibration, problem.config):
+            return
+        if iteration in schedule.lobes_sought:
+            level = schedule.stage(iteration).level
+            found = problem.processes.on_first(lambda: find_lobes(problem, self.model, renderer, level, iteration))
+            found.put_into(calibration.room)
+            for optimizer in self.optimizers:
+                for parameter in (calibration.room.toward, calibration.room.log_sharpness):
+                    optimizer.state.pop(parameter, None)  # it is of another lobe
+            self.guard.keep()  # so that a retreat does not restore the old lobes
 
     def backward(self, loss: Tensor, it: Iteration) -> float:
         """Backpropagate this process's `loss`, and sum the gradients over all processes.

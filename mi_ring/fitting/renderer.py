@@ -35,7 +35,7 @@ class Prediction:
     photographs: Photographs  #: with their cameras and lights as refined so far
     other_light: GlobalIllumination | None  #: interreflection and room light; None: not rendered
     averages: Averages  #: of interreflection, with these photographs; see `Renderer.remember`
-    without_room: Tensor  #: (n, H, W, 3) linear radiance with the room's light as if nothing occluded it; detached
+    without_room: Tensor  #: (n, H, W, 3) linear radiance without what `GlobalIllumination.occlusion` adds; detached
     surface: Surface  #: that was rendered
 
     def detached(self) -> "Prediction":
@@ -96,6 +96,7 @@ class Renderer:
             self.surface, photographs, vertices, material, spp=config.spp, seed=batch.seeds["renderer"],
             shadows=config.shadows and problem.capture.shadows, views=refined,
             lamps=calibration.lamp_tensors() if calibration else [],
+            lobes=calibration.room.lobe_tensors() if calibration and "ambient" in calibration.refined else [],
         )  # fmt: skip
         other, averages = self.other_light(model, batch, photographs, coverage)
         if other and model.ring.indirect:
@@ -103,7 +104,7 @@ class Renderer:
             linear = linear + (calibration.indirect(bounced) if calibration else bounced)
         without_room = linear.detach()
         if other and photographs.harmonics:
-            linear = linear + other.occlusion(torch.from_numpy(photographs.room).to(linear))
+            linear = linear + other.occlusion(torch.from_numpy(photographs.room_strengths).to(linear))
         rgb = calibration.recorded(linear, batch.photographs, batch.scale) if calibration else linear
         return Prediction(vertices, material, rgb, coverage, photographs, other, averages, without_room, self.surface)
 
@@ -136,9 +137,13 @@ class Renderer:
                                     harmonics=harmonics, indirect=indirect)  # fmt: skip
         return averaged(self.averages, other, batch) if indirect and self.surface.table is not None else (other, {})
 
-    def remember(self, prediction: Prediction) -> None:
-        """Store the averages of interreflection that `prediction` contains. The next call of `predict` uses them."""
+    def remember(self, prediction: Prediction) -> Prediction:
+        """Store the averages of interreflection that `prediction` contains. The next call of `predict` uses them.
+
+        Returns `prediction` without gradients.
+        """
         self.averages |= prediction.averages
+        return prediction.detached()
 
     def state(self) -> Averages:
         """Return the averages of interreflection, for a checkpoint."""

@@ -77,6 +77,7 @@ def result_of(
         validation=course.validation,
         masks=list(course.masks),
         room=room_of(problem, refined) if calibration else None,
+        lobes=refined.lobes if calibration else None,
         room_frames=calibration.room.frames if calibration and found_alone else None,
         lamps=lamp_lights(refined.scene) if calibration and "lamps" in calibration.refined else None,
     )

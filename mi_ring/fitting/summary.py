@@ -44,7 +44,8 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
         mean[0] = torch.hypot(torch.from_numpy(deviations["ambient"]).to(mean), room.doubted())
         before, after, spread = (calibration.room_share(light).tolist() for light in (room.given, room.harmonics, mean))
         unknowns["ambient"] = {"what": what, "before": before, "after": after, "std": spread,
-                               "harmonics": room.harmonics.tolist()}  # fmt: skip
+                               "harmonics": room.harmonics.tolist(),
+                               "lobes": [] if refined.lobes is None else refined.lobes.values().tolist()}  # fmt: skip
 
     corners = ring.center.cpu().numpy() + float(ring.radius) * np.concatenate([np.eye(3), -np.eye(3)])
     single = {name: unknown for name, unknown in calibration.unknowns.items() if unknown.single}

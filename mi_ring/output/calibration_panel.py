@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 BEFORE, AFTER = "0.6", "tab:orange"  #: colours
 VISIBLE = 0.01  #: the least shift of a photograph that is drawn [px]
+BRIGHTEST = 3  #: lights of the room that are listed
 LISTED = 6  #: unknowns of one kind that are listed one by one
 
 
@@ -37,8 +38,23 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
     light = refined.get("light", "capture")
     if light != "capture":
         rows.insert(0, ("kind of light, by coarse fits", "", light, ""))
-    rows += [row(entry) for entry in of_photographs(refined["photographs"])]
+    rows += small_lights(after) + [row(entry) for entry in of_photographs(refined["photographs"])]
     return Panel(rows, chart(before, after, refined["photographs"]), ambiguity(light))
+
+
+def small_lights(capture: Capture) -> list[tuple[str, str, str, str]]:
+    """Describe the brightest lobes of the room's light in rows: direction, width, and share of all its light."""
+    lobes = capture.lobes
+    if lobes is None:
+        return []
+    smooth = 0 if capture.room is None else np.sqrt(4 * np.pi) * capture.room[0].mean()
+    shares = lobes.flux.mean(1) / max(lobes.flux.mean(1).sum() + smooth, 1e-12)
+    rows = []
+    for place, k in enumerate(np.argsort(-shares)[:BRIGHTEST]):
+        axes, wide = "camera" if lobes.in_camera[k] else "world", np.degrees(lobes.sharpness[k] ** -0.5)
+        what = f"{'brightest light' if place == 0 else 'another light'}: direction in the axes of the {axes}"
+        rows.append((what, "", f"{numbers(lobes.toward[k], 3)}; {wide:.2g}° wide; {shares[k]:.0%} of the light", ""))
+    return rows
 
 
 def row(entry: dict[str, Any]) -> tuple[str, str, str, str]:
@@ -126,7 +142,7 @@ def chart(before: Capture, after: Capture, photographs: dict[str, dict[str, Any]
     for bars in others:
         if light is not None:
             frame = "camera" if light[PER_FRAME:].any() else "world"
-            radiance = room_envmap(light, np.eye(4)).clip(min=0)
+            radiance = room_envmap(light, np.eye(4), lobes=after.lobes).clip(min=0)
             bars.imshow(linear_to_srgb(radiance / max(float(radiance.max()), 1e-9)))
             bars.axis("off")
             bars.set_title(f"the environment, by longitude and latitude, y of the {frame} up", fontsize=9)

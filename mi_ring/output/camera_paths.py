@@ -244,7 +244,7 @@ def render_views(
             sensor = view.sensor or load_element(photograph_element(view.shot))
             yield render_passes(surface.scene, sensor, integrator, config.spp, seed=k)
         else:
-            one = Photographs.of([view.shot], capture.room)
+            one = Photographs.of([view.shot], capture.room, capture.lobes)
             rgb, _ = prediction.draw(surface, one, spp=config.spp, shadows=capture.shadows, indirect=ring.indirect)
             yield rgb[0].numpy()
 

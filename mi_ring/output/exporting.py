@@ -13,10 +13,9 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.output import gltf
 from mi_ring.output.atlas import rasterise, reflectances, unwrap
-from mi_ring.output.mitsuba_scene import write_scene
+from mi_ring.output.mitsuba_scene import Lit, write_scene
 from mi_ring.output.obj import write_obj
 from mi_ring.output.ply import write_mesh
-from mi_ring.scene.shot import Shot
 from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.system.files import all_or_none, require_place, write_file
 
@@ -31,7 +30,7 @@ FILLED = 0.6  #: share of the texels that show a part of the surface
 def export(
     ring: FittedObject, file: str | Path, subdivisions: int | None = None, resolution: int | None = None,
     time: float = 1.0, metres: float | None = None, views: Sequence[MaskedCamera] | None = None,
-    photograph: tuple[Shot, np.ndarray | None] | None = None,
+    photograph: Lit | None = None,
 ) -> list[Path]:  # fmt: skip
     """Write a fitted object as PLY, OBJ, GLB or Mitsuba XML, by the suffix of `file`. Returns all files written.
 
@@ -39,8 +38,8 @@ def export(
     `resolution`: width of the textures [px]; None: see `resolution_of`. `time`: state of the deformation, from 0 (start
     surface) to 1 (fitted object). `metres`: length of a scene unit [m], only for GLB; None: the length that `ring`
     knows, if any. `views`: cameras and masks of the photographs; PLY and GLB then mark the vertices that a photograph
-    shows. `photograph`: for XML, a pair of the photograph whose camera and light are written and the room light,
-    spherical harmonics (BASIS, 3) or None.
+    shows. `photograph`: for XML, the photograph whose camera and light are written, and the room light: spherical
+    harmonics (BASIS, 3) or None, and lobes or None.
 
     Raises InputError for values out of range, for a BSDF that glTF cannot express, and if a file cannot be written.
     """

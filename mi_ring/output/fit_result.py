@@ -11,6 +11,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import Light
+from mi_ring.scene.lobes import Lobes
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class FitResult:
     masks: Collection[int]  #: indices of photographs with refined masks
     room: np.ndarray | None  #: (BASIS, 3) room light for the scene file, without the scene's own environment
     room_frames: Collection[str] | None  #: axes of the room light in the scene file; None: as in the given scene
+    lobes: Lobes | None  #: small lights of the room; None: there are none
     lamps: Sequence[Light] | None  #: lamps for the scene file; None: as in the given scene
 
     @functools.cached_property

@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import TypeAlias
 
 import mitsuba as mi
 import numpy as np
@@ -15,16 +16,20 @@ from mi_ring.output.atlas import Atlas, Texels
 from mi_ring.output.ply import write_ply
 from mi_ring.rendering.spherical_harmonics import room_envmap, room_of
 from mi_ring.scene.alignment import to_flat
+from mi_ring.scene.lobes import Lobes, lobes_of
 from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.scene.shot import Shot
 from mi_ring.system.files import write_file
 
+#: A photograph and the light of its room: spherical harmonics (BASIS, 3), perhaps lobes. None: no such light.
+Lit: TypeAlias = tuple[Shot, np.ndarray | None] | tuple[Shot, np.ndarray | None, Lobes | None]
 
-def first_photograph(run: Path) -> tuple[Shot, np.ndarray | None]:
+
+def first_photograph(run: Path) -> Lit:
     """Read scene.xml in the results folder `run`.
 
-    Returns (first photograph, room light as spherical harmonics (BASIS, 3) or None). Raises InputError if there is no
-    scene.xml, or if neither the photograph nor the room has a light.
+    Returns (first photograph, room light as spherical harmonics (BASIS, 3) or None, lobes of the room light or None).
+    Raises InputError if there is no scene.xml, or if neither the photograph nor the room has a light.
     """
     if not run.is_dir():
         raise InputError(f"{run}: a scene for Mitsuba takes its camera from the results folder; give the folder")
@@ -33,19 +38,19 @@ def first_photograph(run: Path) -> tuple[Shot, np.ndarray | None]:
     if room is None and not shots[0].own_light.rgb.any():
         raise InputError(f"{run}/scene.xml: a scene for Mitsuba needs the photographs' own light, and there is "
                          "none; export OBJ or GLB and light it yourself")  # fmt: skip
-    return shots[0], room
+    return shots[0], room, lobes_of(scene)
 
 
 def write_scene(
     path: Path, atlas: Atlas, texels: Texels, bsdf: str, values: dict[str, np.ndarray], shot: Shot,
-    room: np.ndarray | None,
+    room: np.ndarray | None, lobes: Lobes | None = None,
 ) -> list[Path]:  # fmt: skip
     """Write a scene with the textured object, and camera and light of a photograph. Returns the paths of its files.
 
     `path`: the XML file; the other files lie beside it. `texels`: the N points with values, and which of them each
     texel shows. `values`: BSDF parameters (N, 3) or (N,) by name. `bsdf`: Mitsuba's XML. `shot`: the photograph. The
     cone of its flash is left out. `room` (BASIS, 3): room light, spherical harmonics; it becomes an environment map if
-    the photograph has no light. None: no room light.
+    the photograph has no light. None: no room light. `lobes`: small lights of the room.
     """
     files = [path]
     mesh = mesh_of(atlas.vertices, atlas.faces, uv=atlas.uv)
@@ -93,7 +98,7 @@ def write_scene(
         scene.append(emitter_element(light._replace(rgb=light.rgb / scale)))  # reflectances are scaled
     elif room is not None:
         files.append(path.with_name(f"{path.stem}_environment.exr"))
-        radiance = room_envmap(room, shot.camera.to_world).clip(min=0) / scale
+        radiance = room_envmap(room, shot.camera.to_world, lobes=lobes).clip(min=0) / scale
         write_image(radiance.astype(np.float32), files[-1])
         environment = ElementTree.SubElement(scene, "emitter", type="envmap")
         ElementTree.SubElement(environment, "string", name="filename", value=files[-1].name)

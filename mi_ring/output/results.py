@@ -174,13 +174,13 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     unseen = write_mesh(ring, ring.subdivisions, folder / "mesh.ply", views=views)
     scene = at_level(scene, ring.subdivisions)  # details have changed it
     if result.summary:
-        scene = recalibrated_xml(scene, capture.shots, result.room, result.room_frames, result.lamps)
+        scene = recalibrated_xml(scene, capture.shots, result.room, result.room_frames, result.lamps, result.lobes)
     if result.masks:
         scene = remasked_xml(scene, capture.shots, write_masks(folder / "masks", capture, result.masks))
     write_file(folder / "scene.xml", scene)
     if not capture.photographs.lit.all() and capture.room is not None and not shared_emitters(capture.scene):
         # The room is the only light of photographs.
-        radiance = room_envmap(capture.room, np.eye(4)).clip(min=0)
+        radiance = room_envmap(capture.room, np.eye(4), lobes=capture.lobes).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
     print("Writing the report", flush=True)
     names = [capture.names[k] for k in result.held_out]

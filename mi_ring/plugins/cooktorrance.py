@@ -1,23 +1,24 @@
 """The `cooktorrance` BSDF: equation 1 of the paper (Mitsuba plugin)."""
 
-import functools
-import math
 from typing import Any, ClassVar, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_ring.rendering.bsdf_lobes import (
+    DARKER,
+    DISTRIBUTIONS,
+    GLOSS_NODES,
+    MIN_ROUGHNESS,
+    cosine_factors,
+    gloss_table,
+    rough_lobe,
+    softened_cosine,
+    widened_roughness,
+)
 from mi_ring.rendering.direct_light import MIN_COSINE
 
-MIN_ROUGHNESS = 0.02  #: a highlight of less is too narrow for float32
-DISTRIBUTIONS = {"ggx": mi.MicrofacetType.GGX, "beckmann": mi.MicrofacetType.Beckmann}
-GLOSS_NODES, GLOSS_SAMPLES = (
-    32,
-    32,
-)  #: of `gloss_table`: nodes along each axis, and samples of each node along each axis
 ROUGHNESS = "vertex_diffuse_roughness"
-#: The rough diffuse term is divided by 1 + DARKER σ. Its mean albedo is (1 + MEAN σ) / (1 + DARKER σ) of Lambert's.
-DARKER, MEAN = 1 / 2 - 2 / (3 * math.pi), 2 / 3 - 28 / (15 * math.pi)
 
 
 class Parameters(NamedTuple):
@@ -165,10 +166,7 @@ class CookTorrance(mi.BSDF):
         facets, specular = self.microfacets(here.roughness), self.with_fresnel(here.specular, dr.dot(si.wi, h))
         # G with m = n: G only uses the side of m, and `front` tests the side.
         gloss = specular * facets.eval(h) * facets.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
-        beside = dr.dot(i, o) - i.z * o.z
-        back = beside / dr.select(beside > 0, dr.maximum(i.z, o.z), 1)
-        sigma = here.diffuse_roughness
-        matte = here.diffuse * (1 + sigma * back) / (1 + DARKER * sigma)
+        matte = here.diffuse * roughened(i, o, here.diffuse_roughness)
         value = matte * ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         value += gloss * ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         return dr.select(active & self.front(si, wo), value * i.z, 0)
@@ -199,6 +197,22 @@ class CookTorrance(mi.BSDF):
             (si.to_world(dr.normalize(mean)), matte),
             (si.to_world(toward), [specular * factor for factor in factors]),
         ]
+
+    def reflected_lobe(self, si, direction, sharpness, active=True):
+        """Compute the radiance that the surface reflects to the viewer by a lobe of light of unit flux.
+
+        The light is a von Mises–Fisher distribution about the unit vector `direction` (in the world), of this
+        `sharpness`. The diffuse part is exact for a diffuse roughness of 0. The specular part is that of a directional
+        light on a rougher surface. Both are exact for sharp lobes. Attached to all arguments.
+        """
+        here, wo = self.parameters(si, active), si.to_local(direction)
+        active &= self.front(si, mi.Vector3f(0, 0, 1))
+        i, o = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (wo, si.wi))
+        matte = here.diffuse * roughened(i, o, here.diffuse_roughness) * softened_cosine(wo.z, sharpness)
+        h = dr.normalize(wo + si.wi)
+        wide = widened_roughness(here.roughness, sharpness, dr.dot(si.wi, h), self.distribution)
+        gloss = self.reflected(gloss_alone(), si, wo, here._replace(roughness=wide), active)
+        return dr.select(active, dr.maximum(matte, 0), 0) + gloss
 
     def gloss_probability(self, ctx, si, here):
         """Compute the probability with which `sample` chooses the specular lobe: 4 ρᵞ / (π ρᵈ + 4 ρᵞ).
@@ -266,84 +280,18 @@ class CookTorrance(mi.BSDF):
         return f"CookTorrance[distribution={self.distribution}, {inner}]"
 
 
-def rough_lobe(cosine, sigma):
-    """Compute the diffuse lobe of roughness `sigma` with π ρᵈ = 1, seen at this `cosine`, n·o. Returns three arrays.
-
-    They are the integrals over all i of the lobe L (its albedo, from "EON", Portsmouth, Kutz and Hill 2024), and of L
-    times two components of i: that along the surface on the viewer's side, divided by sin(n, o), and that along n.
-    """
-    mu = dr.maximum(cosine, MIN_COSINE)
-    sine, angle = dr.safe_sqrt(1 - mu**2), dr.safe_acos(mu)
-    albedo = sine * (angle - sine * mu) + 2 / 3 * (sine / mu * (1 - sine**3) - sine)
-    aside = dr.pi / 2 * (1 - mu - (1 - mu**3) / 3 + (1 - sine**4) / (4 * mu) + 1 / 4)
-    rest = dr.pi / 16 - angle / 8 + dr.sin(4 * angle) / 32
-    along = 2 * sine * (sine**3 / 3 + rest / mu - dr.pi / 16)
-    darker, back = 1 / (1 + DARKER * sigma), sigma / dr.pi
-    return darker * (1 + back * albedo), darker * back * aside, darker * (2 / 3 + back * along)
+def roughened(i, o, sigma):
+    """Compute the factor of the diffuse reflectance by its roughness `sigma`, for light from `i`, seen from `o`."""
+    beside = dr.dot(i, o) - i.z * o.z
+    back = beside / dr.select(beside > 0, dr.maximum(i.z, o.z), 1)
+    return (1 + sigma * back) / (1 + DARKER * sigma)
 
 
-def cosine_factors(order):
-    """Compute the factors by which a diffuse surface with ρᵈ = 1 multiplies spherical harmonics of incident light.
-
-    Returns a list of `order` + 1 numbers for the degrees 0 to `order`: the coefficients of the clamped cosine.
-    """
-    factors = [math.pi, 2 * math.pi / 3]
-    for degree in range(2, order + 1):
-        half = degree // 2
-        central = math.comb(degree, half) / 2**degree
-        sign = (-1) ** (half - 1)
-        factors.append(0.0 if degree % 2 else 2 * math.pi * sign / ((degree + 2) * (degree - 1)) * central)
-    return factors[: order + 1]
-
-
-@functools.lru_cache(maxsize=8)
-def gloss_table(variant, distribution, order):
-    """Tabulate the specular lobe for a specular reflectance of 1. Returns a Dr.Jit texture over (roughness, n·o).
-
-    The roughness goes from 0.02 to 1, n·o from 0 to 1. n is the normal, o the direction to the viewer. Channels 0 and 1
-    describe the mean direction of the lobe. Channel 0 is its component along the surface, opposite to o, divided by the
-    component of o along the surface. Channel 1 is its component along n. Channel 2 + l is the integral of the lobe
-    times the Legendre polynomial of degree l about the mean direction, for l from 0 to `order`. The integrals are means
-    over a grid of visible normals.
-
-    `variant`: Mitsuba's current variant, which only serves as a key of the cache. `distribution`: ``ggx`` or
-    ``beckmann``.
-    """
-    with dr.suspend_grad():
-        count = GLOSS_SAMPLES**2
-        lane = dr.arange(mi.UInt32, GLOSS_NODES**2 * count)
-        node, sample = lane // count, lane % count
-        r = MIN_ROUGHNESS + mi.Float(node % GLOSS_NODES) / (GLOSS_NODES - 1) * (1 - MIN_ROUGHNESS)
-        cosine = dr.clip(mi.Float(node // GLOSS_NODES) / (GLOSS_NODES - 1), MIN_COSINE, 1 - 1e-4)
-        o = mi.Vector3f(dr.sqrt(1 - cosine**2), 0, cosine)
-        facets = mi.MicrofacetDistribution(DISTRIBUTIONS[distribution], r, True)
-        h, _ = facets.sample(
-            o,
-            mi.Point2f((sample % GLOSS_SAMPLES + 0.5) / GLOSS_SAMPLES, (sample // GLOSS_SAMPLES + 0.5) / GLOSS_SAMPLES),
-        )
-        i = mi.reflect(o, h)
-        weight = dr.select(i.z > 0, 4 * facets.G(i, o, mi.Normal3f(0, 0, 1)) / facets.smith_g1(o, h), 0)
-        mean = [dr.block_sum(weight * part, count) for part in (i.x, i.z)]
-        length = dr.rsqrt(mean[0] ** 2 + mean[1] ** 2)
-        x, z = mean[0] * length, mean[1] * length
-        toward = mi.Vector3f(dr.gather(mi.Float, x, node), 0, dr.gather(mi.Float, z, node))
-        away = dr.gather(mi.Float, o.x, dr.arange(mi.UInt32, GLOSS_NODES**2) * count)
-        polynomials = legendre(dr.dot(i, toward), order)
-        channels = [-x / away, z, *(dr.block_sum(weight * p, count) / count for p in polynomials)]
-        table = dr.zeros(mi.Float, GLOSS_NODES**2 * len(channels))
-        for k, channel in enumerate(channels):
-            dr.scatter(table, channel, dr.arange(mi.UInt32, GLOSS_NODES**2) * len(channels) + k)
-        return mi.Texture2f(
-            mi.TensorXf(table, (GLOSS_NODES, GLOSS_NODES, len(channels))), use_accel=False, wrap_mode=dr.WrapMode.Clamp
-        )
-
-
-def legendre(x, order):
-    """Evaluate the Legendre polynomials at `x`. Returns a list of `order` + 1 values, for the degrees 0 to `order`."""
-    found = [mi.Float(1), x]
-    for n in range(1, order):
-        found.append(((2 * n + 1) * x * found[n] - n * found[n - 1]) / (n + 1))
-    return found[: order + 1]
+def gloss_alone():
+    """Make a context in which a BSDF has its specular part only."""
+    context = mi.BSDFContext()
+    context.component = 1
+    return context
 
 
 mi.register_bsdf("cooktorrance", CookTorrance)

@@ -15,8 +15,9 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None, s
     The result is attached (it carries gradients). `light`: function from `si` to (DirectionSample3f, intensity /
     distance²) of the photograph's own light; None: it has none. `next_2d`: function that returns random points; each
     emitter of the scene that lights all photographs gets one. `shadows`: the own light casts shadows; the other
-    emitters always do. `rooms`: also sample `room` emitters. `room_radiance`: function from `si` to radiance that is
-    added; None: nothing is added. `shared`: factor of all light but the own light, one for each of `si`; None: 1.
+    emitters always do. `rooms`: also sample `room` emitters. `room_radiance`: function of `si` and `next_2d` to
+    radiance that is added; None: nothing is added. `shared`: factor of all light but the own light, one for each of
+    `si`; None: 1.
     """
     context, bsdf, active = mi.BSDFContext(), si.bsdf(), si.is_valid()
     # At an outline interpolated normals turn away before the faces do. A black strip there would be another edge.
@@ -33,7 +34,7 @@ def shade(scene, si, light, next_2d, shadows, rooms=False, room_radiance=None, s
     radiance = reflected(*light(si), shadows) if light else dr.zeros(mi.Color3f, dr.width(si.t))
     factor = 1 if shared is None else shared
     if room_radiance:
-        radiance += dr.select(active, factor * room_radiance(si), 0)
+        radiance += dr.select(active, factor * room_radiance(si, next_2d), 0)
     for emitter in shared_emitters(scene, rooms):
         radiance += factor * reflected(*emitter.sample_direction(si, next_2d(), active), True)
         if emitter.is_environment():
@@ -72,8 +73,8 @@ def trace(scene, ray, view, photographs, shadows, next_2d, active=True):
     """Trace camera rays, one per lane, and shade what they hit. Returns [R, G, B, coverage], with 0 in inactive lanes.
 
     `view`: index of the photograph of each lane, whose light is used. `next_2d`: function that returns random points.
-    `shadows`: the photographs' own lights cast shadows. The radiance contains the light of the room as if nothing
-    blocked it. Coverage is 1 where a ray hits a shape.
+    `shadows`: the photographs' own lights cast shadows. The radiance contains the light of the room: its
+    harmonics as if nothing blocked them, its lobes with shadows. Coverage is 1 where a ray hits a shape.
     """
     shadows = shadows and photographs.casts_shadows
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)

@@ -27,11 +27,12 @@ class GlobalIllumination:
     """
 
     radiance: Tensor  #: (N, h, w, 3) of interreflection
-    harmonics: list[int]  #: of `mi_ring.rendering.spherical_harmonics`, n of them
-    #: (n, N, h, w, 3) radiance in a room whose radiance is one of these harmonics; 0 if the room's light does not reach
-    #: a photograph
+    harmonics: list[int]  #: rows of `Photographs.room_strengths`, n of them: harmonics and lobes of the room light
+    #: (n, N, h, w, 3) radiance in a room whose radiance is one of these harmonics or lobes; 0 if the room's light does
+    #: not reach a photograph
     transfer: Tensor
-    unoccluded: Tensor  #: (n, N, h, w, 3) `transfer` as if nothing hid the room from the surface: once reflected light
+    #: (n, N, h, w, 3) once reflected light, that of harmonics as if nothing hid the room from the surface
+    unoccluded: Tensor
     alpha: Tensor  #: (N, h, w) coverage
     coverage: Tensor  #: (N, H, W) coverage in the large pictures
     factor: int  #: how many times larger these are
@@ -47,7 +48,7 @@ class GlobalIllumination:
         side of the small pictures [px]. `paths`: paths per pixel. If these are None: 32 px and 16 paths, or 128 px and
         3 paths if the scene has a table. This light varies slowly, so a few good pixels are better than many noisy
         ones. `indirect`: False: no interreflection; the room light then has its occlusion, but is reflected only once.
-        `harmonics`: indices of the spherical harmonics of room light; empty: no room light.
+        `harmonics`: see the attribute; empty: no room light.
         """
         bounces = BOUNCES if indirect else 1
         table = surface.table if indirect else None  # a table reflects light; alone it would hide the room's
@@ -76,16 +77,16 @@ class GlobalIllumination:
     def room_light(self, room: Tensor) -> Tensor:
         """Compute the linear radiance (N, H, W, 3) that room light adds to the photographs at full size.
 
-        It includes the shadows of the room light. `room` (BASIS, 3): spherical harmonics of the room light; only those
-        in `harmonics` count.
+        It includes the shadows of the room light. `room`: as `Photographs.room_strengths`; only the rows in
+        `harmonics` count.
         """
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
 
     def occlusion(self, room: Tensor) -> Tensor:
-        """Compute what to add to photographs at full size that contain room light as if nothing blocked it.
+        """Compute what to add to photographs at full size that contain room light that is reflected once.
 
-        Returns linear radiance (N, H, W, 3): the shadows of the room light, as negative values, and its
-        interreflection. `room` (BASIS, 3): spherical harmonics of the room light; only those in `harmonics` count.
+        Returns linear radiance (N, H, W, 3): the shadows of harmonics, as negative values, and interreflection. `room`:
+        as `Photographs.room_strengths`; only the rows in `harmonics` count.
         """
         difference = self.transfer - self.unoccluded
         return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))

@@ -5,7 +5,7 @@ import mitsuba as mi
 
 from mi_ring.rendering.direct_light import next_2d, shade
 from mi_ring.rendering.photographs import pixel_rays
-from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes, evaluated_harmonics, reflected_harmonics
+from mi_ring.rendering.spherical_harmonics import BASIS, bsdfs_with_lobes, evaluated_harmonics, reflected_harmonics
 
 BOUNCES = 3  #: points of a path after the first surface
 
@@ -18,9 +18,10 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
     longer paths are missing. `spp`: paths per pixel. `table`: a scene of tables, which paths can hit after their first
     point; it casts no shadows. None: no table.
 
-    `harmonics`: n indices of spherical harmonics. For these, 6 n more Floats follow. The first 3 n are R, G, B of the
-    radiance transfer of each harmonic: the radiance of the surface in a room whose radiance is this harmonic, with
-    shadows and interreflection. The last 3 n are the same without shadows and interreflection, and have no noise.
+    `harmonics`: n indices of spherical harmonics; indices from BASIS on are those of all lobes of `photographs`. For
+    these, 6 n more Floats follow. The first 3 n are R, G, B of the radiance transfer of each harmonic: the radiance of
+    the surface in a room whose radiance is this harmonic, with shadows and interreflection; for a lobe, its flux is 1.
+    The last 3 n are the same without interreflection, those of harmonics also without shadows and without noise.
     """
     with dr.suspend_grad():
         ray, view = pixel_rays(photographs, spp, seed)
@@ -34,15 +35,22 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
             random = next_2d(seed ^ 0x2545F491, dr.width(lane), lane + photographs.first_lane(spp))
             pose = photographs.camera(view).to_world
             bsdfs = bsdfs_with_lobes(scene) if harmonics else []
-            unoccluded = reflected_harmonics(bsdfs, si, pose, harmonics, si.is_valid()) if harmonics else []
-            radiance, escaped, blocked = trace_paths(scene, si, view, photographs, bounces, random, table, bsdfs)
+            smooth = [k for k in harmonics if k < BASIS]
+            lobes = photographs.lobes if len(smooth) < len(harmonics) else None
+            unoccluded = reflected_harmonics(bsdfs, si, pose, smooth, si.is_valid()) if smooth else []
+            direct = lobes.reflected(scene, bsdfs, si, pose, random, si.is_valid()) if lobes else []
+            radiance, escaped, blocked, bounced = trace_paths(
+                scene, si, view, photographs, bounces, random, table, bsdfs, lobes
+            )
             values = [*radiance]
             if harmonics:
                 added, removed = (
-                    [value * throughput for value in evaluated_harmonics(direction, pose, harmonics)]
+                    [value * throughput for value in evaluated_harmonics(direction, pose, smooth)] if smooth else []
                     for throughput, direction in (escaped, blocked)
                 )
                 transfer = [u + a - r for u, a, r in zip(unoccluded, added, removed)]
+                transfer += [once + more for once, more in zip(direct, bounced)]
+                unoccluded = [*unoccluded, *direct]
                 values += [value for colour in (*transfer, *unoccluded) for value in colour]
             for channel, value in zip(channels, values):
                 dr.scatter(channel, value, lane)
@@ -51,12 +59,13 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
         return [dr.block_sum(c, spp) / spp for c in channels]
 
 
-def trace_paths(scene, si, view, photographs, bounces, random, table=None, known=()):
+def trace_paths(scene, si, view, photographs, bounces, random, table=None, known=(), lobes=None):
     """Trace one path per lane for the light that arrives at the surface interactions `si` from other surfaces.
 
-    Returns (radiance, escaped, blocked). `radiance`: this light, reflected by `si` to the viewer. `escaped`:
+    Returns (radiance, escaped, blocked, bounced). `radiance`: this light, reflected by `si` to the viewer. `escaped`:
     (throughput, direction) of paths that leave the scene. `blocked`: (throughput, direction) of paths that start at a
-    BSDF in `known` and hit another surface directly after `si`. Throughputs of all other paths are 0.
+    BSDF in `known` and hit another surface directly after `si`. Throughputs of all other paths are 0. `bounced`: list
+    of the radiance by each of the `lobes`, if its flux is 1; they light as many points of a path as harmonics do.
 
     `view`: index of the photograph of each lane. `bounces`: number of points of a path after `si`. `random`: function
     that returns random points in [0, 1)². `table`: a scene of tables, which paths can also hit; None: no table.
@@ -70,6 +79,8 @@ def trace_paths(scene, si, view, photographs, bounces, random, table=None, known
     for bsdf in known:
         is_known |= si.bsdf() == mi.BSDFPtr(bsdf)
     lighting, shared = photographs.lighting(view), photographs.shared(view)
+    pose = photographs.camera(view).to_world
+    bounced = [mi.Color3f(0) for _ in range(len(lobes or ()))]
     for bounce in range(bounces):
         sample, weight = si.bsdf().sample(context, si, random().x, random(), active)
         throughput = dr.select(active, throughput * weight, 0)
@@ -90,7 +101,10 @@ def trace_paths(scene, si, view, photographs, bounces, random, table=None, known
         # Paths that leave toward an environment add nothing: `shade` has its light at each surface.
         lit = shade(scene, si, lighting, random, True, shared=shared)
         radiance += dr.select(active, throughput * lit, 0)
-    return radiance, (escaped, direction), blocked
+        if lobes is not None and bounce < bounces - 1:
+            one, lit = lobes.bounced(scene, si, pose, random, active)
+            bounced = [sum_ + dr.select(active & (one == j), throughput * lit, 0) for j, sum_ in enumerate(bounced)]
+    return radiance, (escaped, direction), blocked, bounced
 
 
 def separate_kernels(values) -> None:

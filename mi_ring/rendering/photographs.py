@@ -8,11 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.rendering.lobe_light import LobeLight
 from mi_ring.rendering.photograph_lights import Lights, flash_falloff
 from mi_ring.rendering.pinhole import Pinhole
-from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes, reflected_harmonics
+from mi_ring.rendering.spherical_harmonics import BASIS, bsdfs_with_lobes, reflected_harmonics
 from mi_ring.rendering.views import Views
 from mi_ring.scene.alignment import to_flat
+from mi_ring.scene.lobes import Lobes
 from mi_ring.scene.shot import Shot
 
 LANES = 2**22  #: rays at once where memory must be bounded: about a gigabyte
@@ -34,11 +36,14 @@ class Photographs:
     in_room: np.ndarray  #: (P,) bool, one per photograph: does light reach it that lights all photographs?
     #: Light of the room, (BASIS, 3) in `mi_ring.rendering.spherical_harmonics`; None if there is none.
     room: np.ndarray | None = None
+    lobes: LobeLight | None = None  #: small lights of the room; None if there are none
     before: int = 0  #: number of photographs before these that are rendered elsewhere: random numbers depend on it
 
     @classmethod
-    def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None) -> "Photographs":
+    def of(cls, shots: Sequence[Shot], room: np.ndarray | None = None, lobes: Lobes | None = None) -> "Photographs":
         """Collect cameras and lights of photographs. All are selected. `room` (BASIS, 3): room light; None: none.
+
+        `lobes`: small lights of the room.
 
         `size` becomes that of the first photograph. If photographs have several sizes, select those of one size before
         rendering. Raises SceneError if a light is invalid.
@@ -52,7 +57,7 @@ class Photographs:
         apart = (off | ~lights.is_finite())[lit if lit.any() else slice(None)]
         return cls(
             views.buffers(), lights.finite, dr.arange(mi.UInt32, len(shots)), shots[0].size, not apart.any(), lit,
-            np.array([shot.in_room for shot in shots]), room,
+            np.array([shot.in_room for shot in shots]), room, LobeLight.of(lobes),
         )  # fmt: skip
 
     @classmethod
@@ -167,8 +172,15 @@ class Photographs:
 
     @property
     def harmonics(self) -> list[int]:
-        """Indices of the room's spherical harmonics whose coefficients are not 0."""
-        return [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
+        """Indices of the rows of `room_strengths` that are not 0, and of all lobes."""
+        used = [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
+        return used + [BASIS + j for j in range(len(self.lobes or ()))]
+
+    @property
+    def room_strengths(self) -> np.ndarray:
+        """Room light (BASIS + L, 3): the coefficients of spherical harmonics, then the fluxes of L lobes."""
+        room = np.zeros((BASIS, 3)) if self.room is None else self.room
+        return room if self.lobes is None else np.concatenate([room, self.lobes.flux])
 
     def lighting(self, view):
         """Return a function of surface interactions that computes the own light of photograph `view` there.
@@ -188,18 +200,23 @@ class Photographs:
         return dr.gather(mi.Float, to_flat(mi.Float, self.in_room), dr.gather(mi.UInt32, self.index, view))
 
     def room_radiance(self, scene, view):
-        """Return a function from surface interactions to the room light (Color3f) that they reflect to the viewer.
+        """Return a function that computes the room light (Color3f) that surface interactions reflect to the viewer.
 
-        It assumes that nothing blocks the room light. Its result carries gradients. Returns None if there is no room
-        light. `view`: photograph of each lane, for room light that is fixed to the camera.
+        Its arguments are the interactions, and a function that returns random points. It assumes that nothing blocks
+        the harmonics of the room light; lobes cast shadows. Its result carries gradients. Returns None if there is no
+        room light. `view`: photograph of each lane, for room light that is fixed to the camera.
         """
         which = self.harmonics
         if not which:
             return None
 
-        def radiance(si):
-            buffer = to_flat(mi.Float, self.room[which])
-            values = reflected_harmonics(bsdfs_with_lobes(scene), si, self.camera(view).to_world, which)
+        def radiance(si, random):
+            buffer = to_flat(mi.Float, self.room_strengths[which])
+            bsdfs, pose = bsdfs_with_lobes(scene), self.camera(view).to_world
+            smooth = [k for k in which if k < BASIS]
+            values = reflected_harmonics(bsdfs, si, pose, smooth) if smooth else []
+            if self.lobes is not None:
+                values += self.lobes.reflected(scene, bsdfs, si, pose, random, si.is_valid())
             return sum((value * dr.gather(mi.Color3f, buffer, n) for n, value in enumerate(values)), mi.Color3f(0))
 
         return radiance
@@ -212,6 +229,8 @@ class Photographs:
         own = self.lights.irradiance(point)
         if self.room is not None:
             own[~self.lit] += math.pi * self.room[0] / math.sqrt(4 * math.pi)
+        if self.lobes is not None:
+            own[~self.lit] += self.lobes.flux.sum(0) / 4
         return own
 
     @property

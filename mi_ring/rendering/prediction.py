@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -26,6 +27,7 @@ NO_AREA = 1e-6  #: twice a triangle's area / (longest side)² below which float3
 def render(
     surface: Surface, photographs: Photographs, vertices: Tensor, attributes: dict[str, Tensor], spp: int = 4,
     seed: int = 0, shadows: bool = True, views: Views | None = None, lamps: Sequence[Tensor] = (),
+    lobes: Sequence[Tensor] = (),
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Render N photographs of the surface, each under its own light. Returns differentiable tensors.
 
@@ -34,7 +36,7 @@ def render(
     seed gives the same samples. `shadows`: the photographs' own lights cast shadows. `views`: other cameras and lights
     of all photographs, as tensors; None: those in `photographs`. `lamps`: empty, or (places, strengths) of the scene's
     L lamps, both (L, 3): positions or unit directions toward distant lamps; intensities, or irradiances of distant
-    lamps.
+    lamps. `lobes`: empty, or (unit directions (n, 3), sharpness (n,)) of the lobes in `photographs`.
 
     Returns (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). Gradients with respect to all tensors contain
     shading, outlines and edges of cast shadows. Writes the mesh of `surface`. Call backward at most once, before the
@@ -42,13 +44,17 @@ def render(
     """
     parameters = surface.parameters(vertices, attributes)
     others = [*(views or ()), *lamps]
+    count = len(parameters) + len(others)
     moving = any(tensor.requires_grad for tensor in (vertices, *others))
 
     def program(arrays: list[mi.Float]) -> list[mi.Float]:
         surface.write_arrays(dict(zip(parameters, arrays)))
         if lamps:
-            surface.relight(*arrays[-len(lamps) :])
+            surface.relight(*arrays[count - len(lamps) : count])
         moved = photographs.with_views(Views(*arrays[len(parameters) :][: len(views)])) if views else photographs
+        if lobes and moved.lobes is not None:
+            toward, sharpness = arrays[count:]
+            moved = replace(moved, lobes=replace(moved.lobes, toward=toward, sharpness=sharpness))
         if moving:  # gradients with respect to the material alone need no edges
             surface.edges = Edges.of(surface.scene, surface.edges)
         edges = surface.edges if moving else None
@@ -57,7 +63,7 @@ def render(
     if parameters[POSITIONS].requires_grad:
         points, faces = parameters[POSITIONS].detach(), surface.faces
         parameters[POSITIONS].register_hook(lambda gradient: finite_gradient(gradient, points, faces))
-    channels = differentiable(program, [*parameters.values(), *others], surface)
+    channels = differentiable(program, [*parameters.values(), *others, *lobes], surface)
     *rgb, coverage = (channel.reshape(photographs.shape) for channel in channels)
     return torch.stack(rgb, dim=-1), coverage.clone()
 
@@ -98,7 +104,7 @@ def draw(
     to render, and at what size. `spp`: samples per pixel. `shadows`: the photographs' own lights cast shadows.
     `indirect`: add interreflection, rendered with `paths` paths per pixel in a picture that is at most 128 pixels wide.
     The light of the room in `photographs` is always added. So is the texture of a surface that `show` has written.
-    `occlusion`: True: the surface blocks a part of the room light; False: it blocks none of it, which is faster.
+    `occlusion`: True: the surface blocks a part of the room light; False: only of its lobes, which is faster.
 
     However many pixels and samples there are, this needs about a gigabyte of memory besides the pictures. `indirect` or
     room light need about 100 MB more for each photograph.
@@ -108,13 +114,13 @@ def draw(
         parts.append(evaluated(render_photographs(surface.scene, own, spp, seed, shadows, pixels=pixels)))
     *colours, coverage = (torch.cat(channel).reshape(photographs.shape) for channel in zip(*parts))
     rgb = torch.stack(colours, dim=-1)
-    if indirect or (occlusion and photographs.room is not None):
+    if indirect or (occlusion and photographs.harmonics):
         harmonics = photographs.harmonics
         added = GlobalIllumination.of(surface, photographs, coverage, seed + 1, 128, paths, indirect, harmonics)
         if indirect:
             rgb = rgb + added.interreflection
         if harmonics and occlusion:
-            rgb = (rgb + added.occlusion(torch.from_numpy(photographs.room).to(rgb))).clamp(min=0)
+            rgb = (rgb + added.occlusion(torch.from_numpy(photographs.room_strengths).to(rgb))).clamp(min=0)
     if surface.texture:
         with without_gloss(surface) as is_other:
             how = spp, seed, shadows, indirect, paths, occlusion

@@ -12,6 +12,7 @@ import numpy as np
 
 from mi_ring.scene.assembly import changed_scene, top_level_emitters
 from mi_ring.scene.lights import is_room, shared_emitters
+from mi_ring.scene.lobes import Lobes
 
 MAX_ORDER = 4  #: of the harmonics
 PER_FRAME = (MAX_ORDER + 1) ** 2  #: harmonics in the axes of the world
@@ -144,14 +145,18 @@ def reflected_harmonics(bsdfs: Collection, si, to_world, which: Sequence[int], a
     return total
 
 
-def room_envmap(room: np.ndarray, to_world: np.ndarray, rows: int = ENVMAP_ROWS) -> np.ndarray:
+def room_envmap(
+    room: np.ndarray, to_world: np.ndarray, rows: int = ENVMAP_ROWS, lobes: Lobes | None = None
+) -> np.ndarray:
     """Convert room light (BASIS, 3) to an environment map (rows, 2 rows, 3), with the axes of Mitsuba's `envmap`.
 
-    `to_world`: pose of the camera, for harmonics in the axes of the camera. The radiance may be negative in some
-    directions, because there are few harmonics.
+    `to_world`: pose of the camera, for light in the axes of the camera. `lobes`: small lights, which are added. The
+    radiance may be negative in some directions, because there are few harmonics.
     """
     directions, _ = envmap_directions(rows)
     which, values = np.flatnonzero(room.any(1)).tolist() or [0], np.zeros((len(directions), 3))
     for k, harmonic in zip(which, evaluated_harmonics(mi.Vector3f(*directions.T), mi.Matrix4f(to_world), which)):
         values += np.asarray(dr.detach(harmonic) + dr.zeros(mi.Float, len(directions)))[:, None] * room[k]
+    if lobes is not None:
+        values += lobes.radiance(directions, np.asarray(to_world))
     return values.reshape(rows, 2 * rows, 3)
