@@ -27,7 +27,7 @@ from typing import NamedTuple
 from mi_ring.capture.scenefile import move_names, numbers
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.images import contrasted, linear_to_srgb
-from mi_ring.plugins.cooktorrance import DARKER
+from mi_ring.plugins.matte_reflection import DARKER
 
 # isort: split
 import mitsuba as mi

@@ -15,7 +15,8 @@ from mi_ring.errors import InputError
 from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
-from mi_ring.plugins.cooktorrance import DARKER, MEAN, MIN_ROUGHNESS
+from mi_ring.plugins.matte_reflection import DARKER, MEAN
+from mi_ring.plugins.microfacets import MIN_ROUGHNESS
 from mi_ring.scene.mesh_attributes import constant_values
 from mi_ring.scene.visibility import MaskedCamera, visible_points
 from mi_ring.scene.xml_elements import load_bsdf

@@ -1,32 +1,27 @@
 """The `cooktorrance` BSDF: equation 1 of the paper (Mitsuba plugin)."""
 
-import functools
-import math
 from typing import Any, ClassVar, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_ring.plugins.matte_reflection import DARKER, cosine_factors, rough_lobe
+from mi_ring.plugins.microfacets import DISTRIBUTIONS, GLOSS_NODES, MIN_ROUGHNESS, gloss_table, microfacets
 from mi_ring.rendering.direct_light import MIN_COSINE
 
-MIN_ROUGHNESS = 0.02  #: a highlight of less is too narrow for float32
-DISTRIBUTIONS = {"ggx": mi.MicrofacetType.GGX, "beckmann": mi.MicrofacetType.Beckmann}
-GLOSS_NODES, GLOSS_SAMPLES = (
-    32,
-    32,
-)  #: of `gloss_table`: nodes along each axis, and samples of each node along each axis
 ROUGHNESS = "vertex_diffuse_roughness"
-#: The rough diffuse term is divided by 1 + DARKER σ. Its mean albedo is (1 + MEAN σ) / (1 + DARKER σ) of Lambert's.
-DARKER, MEAN = 1 / 2 - 2 / (3 * math.pi), 2 / 3 - 28 / (15 * math.pi)
+COAT = "coat", "coat_roughness"  #: parameters of the coat
 
 
 class Parameters(NamedTuple):
-    """The parameters at surface interactions, each a Dr.Jit array."""
+    """The parameters at surface interactions, each a Dr.Jit array. Without a coat, its parameters are None."""
 
     diffuse: Any
     specular: Any
     roughness: Any
     diffuse_roughness: Any
+    coat: Any = None
+    coat_roughness: Any = None
 
 
 class CookTorrance(mi.BSDF):
@@ -44,6 +39,11 @@ class CookTorrance(mi.BSDF):
     ``diffuse_roughness`` float or texture  σ of the diffuse term, 0 to 1. Default: the mesh attribute        P, ∂
                                             ``vertex_diffuse_roughness``; 0, as in the paper, if there is
                                             none
+    ``coat``              float or texture  ρᶜ, the strength of a second specular lobe. Default: the mesh     P, ∂
+                                            attribute ``vertex_coat`` if ``coat_roughness`` is given, else
+                                            none
+    ``coat_roughness``    float or texture  its width, like ``roughness``. Default: the mesh attribute        P, ∂
+                                            ``vertex_coat_roughness`` if ``coat`` is given
     ``distribution``      string            D and its G: ``ggx`` or ``beckmann``. Default: ``ggx``
     ``fresnel``           boolean           true: it reflects more at grazing angles. Default: false, as in
                                             the paper
@@ -65,12 +65,17 @@ class CookTorrance(mi.BSDF):
     Energy-Preserving Rough Diffuse BRDF" (Portsmouth, Kutz and Hill 2024), without its second term for light between
     microfacets. Its albedo is at most Lambert's, for every viewer.
 
+    Varnish over wood, glaze over clay and polished metal have a sharp highlight in a wide one. With ``coat``, B has a
+    second specular part, ρᶜ · D(n, h; rᶜ) · G(i, o; rᶜ) / (π (n·i)(n·o)), whose rᶜ is ``coat_roughness``. It has the
+    same D, G and ``fresnel`` as the first. The coat takes no light from the base: what a real one absorbs and reflects
+    is in ρᵈ and ρᵞ. Without ``coat``, nothing of it is computed.
+
     **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh::
 
         ∫ B (n·i) di = π ρᵈ + 4 ρᵞ ∫ D/π · G · (o·h) / (n·o) dh  ≤  π ρᵈ + 4 ρᵞ   for every o,
 
-    and narrow lobes reach this bound without ``fresnel``. A surface with π ρᵈ + 4 ρᵞ ≤ 1 in each channel conserves
-    energy. Nothing enforces this: ρ also contains the scale of lamp and camera.
+    and narrow lobes reach this bound without ``fresnel``. A surface with π ρᵈ + 4 ρᵞ + 4 ρᶜ ≤ 1 in each channel
+    conserves energy. Nothing enforces this: ρ also contains the scale of lamp and camera.
 
     With interpolated normals, a strip about 0.01 px wide at the contour has n·o < 0 on a face that faces the viewer. If
     it were black, this discontinuity would make gradients at the outline wrong. It is lit instead, with n·o clamped.
@@ -98,8 +103,6 @@ class CookTorrance(mi.BSDF):
             }
     """
 
-    #: number of channels of each parameter
-    channels: ClassVar = {"diffuse": 3, "specular": 1, "roughness": 1, "diffuse_roughness": 1}
     optional: ClassVar = {ROUGHNESS}  #: mesh attributes that a mesh may lack: they are then 0
 
     def __init__(self, props):
@@ -112,6 +115,10 @@ class CookTorrance(mi.BSDF):
         if not isinstance(self.fresnel, bool):
             raise ValueError(f'cooktorrance "{props.id()}": fresnel is {self.fresnel}, must be true or false')
         self.reads_optional = "diffuse_roughness" not in props
+        #: number of channels of each parameter
+        self.channels = {"diffuse": 3, "specular": 1, "roughness": 1, "diffuse_roughness": 1}
+        if any(name in props for name in COAT):
+            self.channels |= dict.fromkeys(COAT, 1)
         self.textures = {}
         for name in self.channels:
             if name not in props:
@@ -123,12 +130,17 @@ class CookTorrance(mi.BSDF):
 
     def parameters(self, si, active=True):
         """Evaluate the parameters at the surface interactions `si`. The roughness r is at least 0.02."""
-        diffuse, *others = self.textures.values()
+        textures = self.textures
+        diffuse = textures["diffuse"].eval(si, active)
+        specular, r = (textures[name].eval_1(si, active) for name in ("specular", "roughness"))
+        sigma = 0.0  # scalar variants raise an error if the mesh has no such attribute
         if dr.is_array_v(mi.Float) or not self.reads_optional or si.shape.has_attribute(ROUGHNESS):
-            specular, r, sigma = (texture.eval_1(si, active) for texture in others)
-        else:  # scalar variants raise an error if the mesh has no such attribute
-            specular, r, sigma = *(texture.eval_1(si, active) for texture in others[:2]), 0.0
-        return Parameters(diffuse.eval(si, active), specular, dr.maximum(r, MIN_ROUGHNESS), sigma)
+            sigma = textures["diffuse_roughness"].eval_1(si, active)
+        here = Parameters(diffuse, specular, dr.maximum(r, MIN_ROUGHNESS), sigma)
+        if "coat" not in textures:
+            return here
+        coat, r = (textures[name].eval_1(si, active) for name in COAT)
+        return here._replace(coat=coat, coat_roughness=dr.maximum(r, MIN_ROUGHNESS))
 
     @staticmethod
     def front(si, wo):
@@ -140,14 +152,16 @@ class CookTorrance(mi.BSDF):
         n = si.to_local(si.n)
         return ((si.wi.z > 0) | (dr.dot(si.wi, n) > 0)) & (wo.z > 0)
 
-    def microfacets(self, r):
-        """Make Mitsuba's microfacet distribution for roughness `r`. Its `eval` is D / π, its `G` is G."""
-        return mi.MicrofacetDistribution(DISTRIBUTIONS[self.distribution], r, True)
+    @staticmethod
+    def glosses(here):
+        """List the specular lobes: pairs (strength, roughness). There is one without a coat, otherwise two."""
+        lobes = [(here.specular, here.roughness)]
+        return lobes if here.coat is None else [*lobes, (here.coat, here.coat_roughness)]
 
     def with_fresnel(self, specular, cosine):
         """Return the specular reflectance at an angle between viewer and half vector. `cosine`: of this angle, o·h.
 
-        `specular`: ρᵞ, the reflectance at o = h. Without the parameter ``fresnel``, it is returned unchanged.
+        `specular`: ρᵞ or ρᶜ, the reflectance at o = h. Without the parameter ``fresnel``, it is returned unchanged.
         """
         if not self.fresnel:
             return specular
@@ -162,9 +176,11 @@ class CookTorrance(mi.BSDF):
         o, i = (mi.Vector3f(v.x, v.y, dr.maximum(v.z, MIN_COSINE)) for v in (si.wi, wo))
         h = dr.normalize(wo + si.wi)
         h.z = dr.abs(h.z)  # at the contour h may be below the surface, where Mitsuba's D is 0
-        facets, specular = self.microfacets(here.roughness), self.with_fresnel(here.specular, dr.dot(si.wi, h))
-        # G with m = n: G only uses the side of m, and `front` tests the side.
-        gloss = specular * facets.eval(h) * facets.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
+        gloss = 0
+        for strength, r in self.glosses(here):
+            facets, specular = microfacets(self.distribution, r), self.with_fresnel(strength, dr.dot(si.wi, h))
+            # G with m = n: G only uses the side of m, and `front` tests the side.
+            gloss += specular * facets.eval(h) * facets.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
         beside = dr.dot(i, o) - i.z * o.z
         back = beside / dr.select(beside > 0, dr.maximum(i.z, o.z), 1)
         sigma = here.diffuse_roughness
@@ -174,58 +190,65 @@ class CookTorrance(mi.BSDF):
         return dr.select(active & self.front(si, wo), value * i.z, 0)
 
     def lobes(self, si, order, active=True):
-        """Compute how the surface reflects light that is given by spherical harmonics. Returns two lobes.
+        """Compute how the surface reflects light that is given by spherical harmonics. Returns two or three lobes.
 
-        The first lobe is diffuse, the second specular. A lobe is a pair (axis, factors). The axis is a unit vector in
-        the world, about which the lobe is symmetric. Factor l of the `order` + 1 factors multiplies the light's
-        harmonics of degree l, evaluated at the axis; the sum over l is the reflected radiance. The diffuse lobe is that
-        of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi and Hanrahan 2001). With a
-        ``diffuse_roughness`` it is exact up to degree 1. The specular lobe is an approximation, tabulated over
-        roughness and viewing angle.
+        The first lobe is diffuse, the second specular, and the third is that of a coat. A lobe is a pair (axis,
+        factors). The axis is a unit vector in the world, about which the lobe is symmetric. Factor l of the `order` + 1
+        factors multiplies the light's harmonics of degree l, evaluated at the axis; the sum over l is the reflected
+        radiance. The diffuse lobe is that of "An Efficient Representation for Irradiance Environment Maps" (Ramamoorthi
+        and Hanrahan 2001). With a ``diffuse_roughness`` it is exact up to degree 1. Specular lobes are approximations,
+        tabulated over roughness and viewing angle.
         """
-        diffuse, specular, r, sigma = self.parameters(si, active)
+        here = self.parameters(si, active)
         active &= self.front(si, mi.Vector3f(0, 0, 1))
-        diffuse, specular = dr.select(active, diffuse, 0), dr.select(active, specular, 0)
+        diffuse = dr.select(active, here.diffuse, 0)
+        glosses = [self.gloss_lobe(si, dr.select(active, specular, 0), r, order) for specular, r in self.glosses(here)]
+        albedo, aside, along = rough_lobe(si.wi.z, here.diffuse_roughness)
+        mean = mi.Vector3f(aside * si.wi.x, aside * si.wi.y, along)
+        matte = [diffuse * albedo * factor for factor in cosine_factors(order)]
+        matte[1] = diffuse * dr.pi * dr.norm(mean)
+        return [(si.to_world(dr.normalize(mean)), matte), *glosses]
+
+    def gloss_lobe(self, si, specular, r, order):
+        """Compute a specular lobe of strength `specular` and roughness `r` as the method `lobes` returns it."""
         across = [(r - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS), dr.maximum(si.wi.z, MIN_COSINE)]
         at = mi.Point2f(*(x * (1 - 1 / GLOSS_NODES) + 0.5 / GLOSS_NODES for x in across))
         tilt, height, *factors = gloss_table(mi.variant(), self.distribution, order).eval(at)
         toward = dr.normalize(mi.Vector3f(-tilt * si.wi.x, -tilt * si.wi.y, height))
         specular = self.with_fresnel(specular, dr.dot(si.wi, dr.normalize(si.wi + toward)))
-        albedo, aside, along = rough_lobe(si.wi.z, sigma)
-        mean = mi.Vector3f(aside * si.wi.x, aside * si.wi.y, along)
-        matte = [diffuse * albedo * factor for factor in cosine_factors(order)]
-        matte[1] = diffuse * dr.pi * dr.norm(mean)
-        return [
-            (si.to_world(dr.normalize(mean)), matte),
-            (si.to_world(toward), [specular * factor for factor in factors]),
-        ]
+        return si.to_world(toward), [specular * factor for factor in factors]
 
-    def gloss_probability(self, ctx, si, here):
-        """Compute the probability with which `sample` chooses the specular lobe: 4 ρᵞ / (π ρᵈ + 4 ρᵞ).
+    def gloss_probabilities(self, ctx, si, here):
+        """Compute the probabilities with which `sample` chooses the specular lobes, as a list of one or two arrays.
 
-        π ρᵈ and 4 ρᵞ are upper bounds of the albedos of both lobes. `here`: the parameters at `si`. `ctx`: Mitsuba's
-        BSDFContext; if it switches one lobe off, the result is 0 or 1. The result has no gradients.
+        Without a coat it is 4 ρᵞ / (π ρᵈ + 4 ρᵞ): π ρᵈ and 4 ρᵞ are upper bounds of the albedos of both lobes. A coat
+        adds 4 ρᶜ. `here`: the parameters at `si`. `ctx`: Mitsuba's BSDFContext; if it switches the diffuse or the
+        specular part off, the sum is 1 or 0. The result has no gradients.
         """
         has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         has_gloss = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
+        d = dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(here.diffuse)))
+        bounds = [dr.detach(4 * self.with_fresnel(strength, si.wi.z)) for strength, _ in self.glosses(here)]
+        s = sum(bounds[1:], bounds[0])
+        both = dr.select(d + s > 0, s / (d + s), 0.5)
         if not (has_diffuse and has_gloss):
-            return mi.Float(1.0 if has_gloss else 0.0)
-        d, s = (
-            dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(here.diffuse))),
-            dr.detach(4 * self.with_fresnel(here.specular, si.wi.z)),
-        )
-        return dr.select(d + s > 0, s / (d + s), 0.5)
+            both = mi.Float(1.0 if has_gloss else 0.0)
+        if len(bounds) == 1:
+            return [both]
+        coat = both * dr.select(s > 0, bounds[1] / s, 0.5)
+        return [both - coat, coat]
 
-    def density(self, si, wo, r, gloss, active):
+    def density(self, si, wo, here, probabilities, active):
         """Compute the probability density [1/sr] with which `sample` draws the direction `wo` (local frame of `si`).
 
-        `r`: roughness. `gloss`: probability with which the specular lobe is chosen, 0 to 1.
+        `here`: the parameters at `si`. `probabilities`: those with which the specular lobes are chosen.
         """
-        facets = self.microfacets(r)
         h = dr.normalize(wo + si.wi)
-        # The density of visible normals is D G₁ (o·h) / (n·o), the Jacobian of the reflection 1 / (4 (o·h)).
-        reflected = facets.eval(h) * facets.smith_g1(si.wi, h) / (4 * si.wi.z)
-        pdf = (1 - gloss) * mi.warp.square_to_cosine_hemisphere_pdf(wo) + gloss * reflected
+        pdf = (1 - sum(probabilities[1:], probabilities[0])) * mi.warp.square_to_cosine_hemisphere_pdf(wo)
+        for probability, (_, r) in zip(probabilities, self.glosses(here)):
+            facets = microfacets(self.distribution, r)
+            # The density of visible normals is D G₁ (o·h) / (n·o), the Jacobian of the reflection 1 / (4 (o·h)).
+            pdf += probability * (facets.eval(h) * facets.smith_g1(si.wi, h) / (4 * si.wi.z))
         return dr.select(active & (si.wi.z > 0) & (wo.z > 0), pdf, 0)
 
     def eval(self, ctx, si, wo, active=True):
@@ -233,21 +256,23 @@ class CookTorrance(mi.BSDF):
 
     def pdf(self, ctx, si, wo, active=True):
         here = self.parameters(si, active)
-        return self.density(si, wo, here.roughness, self.gloss_probability(ctx, si, here), active)
+        return self.density(si, wo, here, self.gloss_probabilities(ctx, si, here), active)
 
     def eval_pdf(self, ctx, si, wo, active=True):
         here = self.parameters(si, active)
         value = self.reflected(ctx, si, wo, here, active)
-        return value, self.density(si, wo, here.roughness, self.gloss_probability(ctx, si, here), active)
+        return value, self.density(si, wo, here, self.gloss_probabilities(ctx, si, here), active)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         here = self.parameters(si, active)
-        gloss = self.gloss_probability(ctx, si, here)
-        chosen = sample1 < gloss
-        normal, _ = self.microfacets(here.roughness).sample(si.wi, sample2)
+        probabilities = self.gloss_probabilities(ctx, si, here)
+        chosen, r = sample1 < sum(probabilities[1:], probabilities[0]), here.roughness
+        if here.coat is not None:
+            r = dr.select(sample1 < probabilities[0], r, here.coat_roughness)
+        normal, _ = microfacets(self.distribution, r).sample(si.wi, sample2)
         bs = dr.zeros(mi.BSDFSample3f)
         bs.wo = dr.select(chosen, mi.reflect(si.wi, normal), mi.warp.square_to_cosine_hemisphere(sample2))
-        bs.pdf = self.density(si, bs.wo, here.roughness, gloss, active)
+        bs.pdf = self.density(si, bs.wo, here, probabilities, active)
         bs.eta = 1.0
         bs.sampled_component = dr.select(chosen, mi.UInt32(1), mi.UInt32(0))
         bs.sampled_type = dr.select(
@@ -264,86 +289,6 @@ class CookTorrance(mi.BSDF):
     def to_string(self):
         inner = ", ".join(f"{name}={texture}" for name, texture in self.textures.items())
         return f"CookTorrance[distribution={self.distribution}, {inner}]"
-
-
-def rough_lobe(cosine, sigma):
-    """Compute the diffuse lobe of roughness `sigma` with π ρᵈ = 1, seen at this `cosine`, n·o. Returns three arrays.
-
-    They are the integrals over all i of the lobe L (its albedo, from "EON", Portsmouth, Kutz and Hill 2024), and of L
-    times two components of i: that along the surface on the viewer's side, divided by sin(n, o), and that along n.
-    """
-    mu = dr.maximum(cosine, MIN_COSINE)
-    sine, angle = dr.safe_sqrt(1 - mu**2), dr.safe_acos(mu)
-    albedo = sine * (angle - sine * mu) + 2 / 3 * (sine / mu * (1 - sine**3) - sine)
-    aside = dr.pi / 2 * (1 - mu - (1 - mu**3) / 3 + (1 - sine**4) / (4 * mu) + 1 / 4)
-    rest = dr.pi / 16 - angle / 8 + dr.sin(4 * angle) / 32
-    along = 2 * sine * (sine**3 / 3 + rest / mu - dr.pi / 16)
-    darker, back = 1 / (1 + DARKER * sigma), sigma / dr.pi
-    return darker * (1 + back * albedo), darker * back * aside, darker * (2 / 3 + back * along)
-
-
-def cosine_factors(order):
-    """Compute the factors by which a diffuse surface with ρᵈ = 1 multiplies spherical harmonics of incident light.
-
-    Returns a list of `order` + 1 numbers for the degrees 0 to `order`: the coefficients of the clamped cosine.
-    """
-    factors = [math.pi, 2 * math.pi / 3]
-    for degree in range(2, order + 1):
-        half = degree // 2
-        central = math.comb(degree, half) / 2**degree
-        sign = (-1) ** (half - 1)
-        factors.append(0.0 if degree % 2 else 2 * math.pi * sign / ((degree + 2) * (degree - 1)) * central)
-    return factors[: order + 1]
-
-
-@functools.lru_cache(maxsize=8)
-def gloss_table(variant, distribution, order):
-    """Tabulate the specular lobe for a specular reflectance of 1. Returns a Dr.Jit texture over (roughness, n·o).
-
-    The roughness goes from 0.02 to 1, n·o from 0 to 1. n is the normal, o the direction to the viewer. Channels 0 and 1
-    describe the mean direction of the lobe. Channel 0 is its component along the surface, opposite to o, divided by the
-    component of o along the surface. Channel 1 is its component along n. Channel 2 + l is the integral of the lobe
-    times the Legendre polynomial of degree l about the mean direction, for l from 0 to `order`. The integrals are means
-    over a grid of visible normals.
-
-    `variant`: Mitsuba's current variant, which only serves as a key of the cache. `distribution`: ``ggx`` or
-    ``beckmann``.
-    """
-    with dr.suspend_grad():
-        count = GLOSS_SAMPLES**2
-        lane = dr.arange(mi.UInt32, GLOSS_NODES**2 * count)
-        node, sample = lane // count, lane % count
-        r = MIN_ROUGHNESS + mi.Float(node % GLOSS_NODES) / (GLOSS_NODES - 1) * (1 - MIN_ROUGHNESS)
-        cosine = dr.clip(mi.Float(node // GLOSS_NODES) / (GLOSS_NODES - 1), MIN_COSINE, 1 - 1e-4)
-        o = mi.Vector3f(dr.sqrt(1 - cosine**2), 0, cosine)
-        facets = mi.MicrofacetDistribution(DISTRIBUTIONS[distribution], r, True)
-        h, _ = facets.sample(
-            o,
-            mi.Point2f((sample % GLOSS_SAMPLES + 0.5) / GLOSS_SAMPLES, (sample // GLOSS_SAMPLES + 0.5) / GLOSS_SAMPLES),
-        )
-        i = mi.reflect(o, h)
-        weight = dr.select(i.z > 0, 4 * facets.G(i, o, mi.Normal3f(0, 0, 1)) / facets.smith_g1(o, h), 0)
-        mean = [dr.block_sum(weight * part, count) for part in (i.x, i.z)]
-        length = dr.rsqrt(mean[0] ** 2 + mean[1] ** 2)
-        x, z = mean[0] * length, mean[1] * length
-        toward = mi.Vector3f(dr.gather(mi.Float, x, node), 0, dr.gather(mi.Float, z, node))
-        away = dr.gather(mi.Float, o.x, dr.arange(mi.UInt32, GLOSS_NODES**2) * count)
-        polynomials = legendre(dr.dot(i, toward), order)
-        channels = [-x / away, z, *(dr.block_sum(weight * p, count) / count for p in polynomials)]
-        table = dr.zeros(mi.Float, GLOSS_NODES**2 * len(channels))
-        for k, channel in enumerate(channels):
-            dr.scatter(table, channel, dr.arange(mi.UInt32, GLOSS_NODES**2) * len(channels) + k)
-        return mi.Texture2f(
-            mi.TensorXf(table, (GLOSS_NODES, GLOSS_NODES, len(channels))), use_accel=False, wrap_mode=dr.WrapMode.Clamp
-        )
-
-
-def legendre(x, order):
-    """Evaluate the Legendre polynomials at `x`. Returns a list of `order` + 1 values, for the degrees 0 to `order`."""
-    found = [mi.Float(1), x]
-    for n in range(1, order):
-        found.append(((2 * n + 1) * x * found[n] - n * found[n - 1]) / (n + 1))
-    return found[: order + 1]
 
 
 mi.register_bsdf("cooktorrance", CookTorrance)
