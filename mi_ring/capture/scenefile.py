@@ -298,11 +298,16 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
     return scene_bytes(root)
 
 
-def at_level(scene: bytes, level: int) -> bytes:
-    """Return the scene file of a fit with another `level` of the object's mesh. `scene`: its content."""
+def updated(scene: bytes, level: int, bsdf: str) -> bytes:
+    """Return the scene file of a fit with another `level` of the object's mesh, and with the XML `bsdf` of its BSDF.
+
+    `scene`: its content.
+    """
     root = ElementTree.fromstring(scene)
     shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
     next(e for e in shape if e.get("name") == "subdivisions").set("value", str(level))
+    place = next(k for k, e in enumerate(shape) if e.tag == "bsdf")
+    shape[place] = ElementTree.fromstring(bsdf)
     return scene_bytes(root)
 
 

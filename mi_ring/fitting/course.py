@@ -19,6 +19,7 @@ class Course:
     seconds: float = 0.0  #: time of these iterations, and of coarse fits before them
     log: list[dict[str, Any]] = field(default_factory=list)  #: entries of every fifth iteration and of the last
     masks: Masks = field(default_factory=dict)  #: masks that were found anew
+    lobes: dict[str, float] = field(default_factory=dict)  #: what photographs say about a second lobe of highlights
     validation: dict[str, Any] = field(default_factory=dict)  #: on held-out photographs, when the fit is done
 
     @classmethod

@@ -1,7 +1,7 @@
 """The optimisation: Muon for hidden weights, Adam for all other parameters, and one step of all optimisers."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -171,6 +171,17 @@ class Optimisation:
         if fixed and iteration == schedule.shaping and self.model.calibration:
             self.model.calibration.room.forget()
             self.guard.keep()  # so that a retreat does not restore the old equations
+
+    def follow(self, grown: Iterable[Tensor]) -> None:
+        """Continue with parameters that have `grown` by further rows: Adam knows no gradients of these yet."""
+        for tensor in grown:
+            for optimizer in self.optimizers:
+                state = optimizer.state.get(tensor, {})
+                for name, value in state.items():
+                    if torch.is_tensor(value) and value.ndim:
+                        more = value.new_zeros(len(tensor) - len(value), *value.shape[1:])
+                        state[name] = torch.cat([value, more])
+        self.guard.keep()
 
     def backward(self, loss: Tensor, it: Iteration) -> float:
         """Backpropagate this process's `loss`, and sum the gradients over all processes.

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.reduction import whole_mask
-from mi_ring.capture.scenefile import at_level, fitted_scene_xml, recalibrated_xml, remasked_xml
+from mi_ring.capture.scenefile import fitted_scene_xml, recalibrated_xml, remasked_xml, updated
 from mi_ring.errors import InputError
 from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes, write_image
 from mi_ring.objects.fitted_object import FittedObject
@@ -165,7 +165,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     write_state(compact(ring_state(ring, result.settings)), folder / "ring.pt")
     views = capture.views
     unseen = write_mesh(ring, ring.subdivisions, folder / "mesh.ply", views=views)
-    scene = at_level(scene, ring.subdivisions)  # details have changed it
+    scene = updated(scene, ring.subdivisions, ring.bsdf)  # details and a second lobe have changed them
     if result.summary:
         scene = recalibrated_xml(scene, capture.shots, result.room, result.room_frames, result.lamps)
     if result.masks:
