@@ -67,8 +67,9 @@ class CookTorrance(mi.BSDF):
 
     Varnish over wood, glaze over clay and polished metal have a sharp highlight in a wide one. With ``coat``, B has a
     second specular part, ρᶜ · D(n, h; rᶜ) · G(i, o; rᶜ) / (π (n·i)(n·o)), whose rᶜ is ``coat_roughness``. It has the
-    same D, G and ``fresnel`` as the first. The coat takes no light from the base: what a real one absorbs and reflects
-    is in ρᵈ and ρᵞ. Without ``coat``, nothing of it is computed.
+    same D and G as the first. With ``fresnel``, ρᵞ + ρᶜ grows up to 1/4, and both keep their shares. The coat takes no
+    light from the base: what a real one absorbs and reflects is in ρᵈ and ρᵞ. Without ``coat``, nothing of it is
+    computed.
 
     **Energy.** Substitute di = 4 (o·h) dh in the specular part of the albedo, then G ≤ G₁(o) = n·o / ∫ D/π ⟨o, h⟩ dh::
 
@@ -152,20 +153,31 @@ class CookTorrance(mi.BSDF):
         n = si.to_local(si.n)
         return ((si.wi.z > 0) | (dr.dot(si.wi, n) > 0)) & (wo.z > 0)
 
-    @staticmethod
-    def glosses(here):
-        """List the specular lobes: pairs (strength, roughness). There is one without a coat, otherwise two."""
-        lobes = [(here.specular, here.roughness)]
-        return lobes if here.coat is None else [*lobes, (here.coat, here.coat_roughness)]
+    def glosses(self, here):
+        """List the specular lobes. There is one without a coat, otherwise two. `here`: the parameters.
 
-    def with_fresnel(self, specular, cosine):
-        """Return the specular reflectance at an angle between viewer and half vector. `cosine`: of this angle, o·h.
+        A lobe is a tuple of its strength ρ, of what the Fresnel term adds to it at most, and of its roughness.
+        """
+        total, strengths = here.specular, [(here.specular, here.roughness)]
+        if here.coat is not None:
+            total = here.specular + here.coat
+            strengths.append((here.coat, here.coat_roughness))
+        if not self.fresnel:
+            return [(strength, 0, r) for strength, r in strengths]
+        more = dr.maximum(0.25 - total, 0)
+        if len(strengths) == 1:
+            return [(here.specular, more, here.roughness)]
+        share = dr.select(total > 0, here.coat / total, 0)
+        return [(strength, more * part, r) for part, (strength, r) in zip((1 - share, share), strengths)]
 
-        `specular`: ρᵞ or ρᶜ, the reflectance at o = h. Without the parameter ``fresnel``, it is returned unchanged.
+    def with_fresnel(self, strength, more, cosine):
+        """Return the strength of a lobe at an angle between viewer and half vector. `cosine`: of this angle, o·h.
+
+        `strength`, `more`: of the method `glosses`. Without the parameter ``fresnel``, `strength` is returned.
         """
         if not self.fresnel:
-            return specular
-        return specular + dr.maximum(0.25 - specular, 0) * dr.power(1 - dr.clip(cosine, 0, 1), 5)
+            return strength
+        return strength + more * dr.power(1 - dr.clip(cosine, 0, 1), 5)
 
     def reflected(self, ctx, si, wo, here, active):
         """Evaluate B (n·i) [1/sr], equation 1 times the cosine, for light from direction `wo` (local frame of `si`).
@@ -177,8 +189,8 @@ class CookTorrance(mi.BSDF):
         h = dr.normalize(wo + si.wi)
         h.z = dr.abs(h.z)  # at the contour h may be below the surface, where Mitsuba's D is 0
         gloss = 0
-        for strength, r in self.glosses(here):
-            facets, specular = microfacets(self.distribution, r), self.with_fresnel(strength, dr.dot(si.wi, h))
+        for strength, more, r in self.glosses(here):
+            facets, specular = microfacets(self.distribution, r), self.with_fresnel(strength, more, dr.dot(si.wi, h))
             # G with m = n: G only uses the side of m, and `front` tests the side.
             gloss += specular * facets.eval(h) * facets.G(i, o, mi.Normal3f(0, 0, 1)) / (i.z * o.z)
         beside = dr.dot(i, o) - i.z * o.z
@@ -202,20 +214,24 @@ class CookTorrance(mi.BSDF):
         here = self.parameters(si, active)
         active &= self.front(si, mi.Vector3f(0, 0, 1))
         diffuse = dr.select(active, here.diffuse, 0)
-        glosses = [self.gloss_lobe(si, dr.select(active, specular, 0), r, order) for specular, r in self.glosses(here)]
+        here = here._replace(
+            specular=dr.select(active, here.specular, 0),
+            coat=None if here.coat is None else dr.select(active, here.coat, 0),
+        )
+        glosses = [self.gloss_lobe(si, *gloss, order) for gloss in self.glosses(here)]
         albedo, aside, along = rough_lobe(si.wi.z, here.diffuse_roughness)
         mean = mi.Vector3f(aside * si.wi.x, aside * si.wi.y, along)
         matte = [diffuse * albedo * factor for factor in cosine_factors(order)]
         matte[1] = diffuse * dr.pi * dr.norm(mean)
         return [(si.to_world(dr.normalize(mean)), matte), *glosses]
 
-    def gloss_lobe(self, si, specular, r, order):
-        """Compute a specular lobe of strength `specular` and roughness `r` as the method `lobes` returns it."""
+    def gloss_lobe(self, si, strength, more, r, order):
+        """Compute a specular lobe as the method `lobes` returns it. `strength`, `more`, `r`: of `glosses`."""
         across = [(r - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS), dr.maximum(si.wi.z, MIN_COSINE)]
         at = mi.Point2f(*(x * (1 - 1 / GLOSS_NODES) + 0.5 / GLOSS_NODES for x in across))
         tilt, height, *factors = gloss_table(mi.variant(), self.distribution, order).eval(at)
         toward = dr.normalize(mi.Vector3f(-tilt * si.wi.x, -tilt * si.wi.y, height))
-        specular = self.with_fresnel(specular, dr.dot(si.wi, dr.normalize(si.wi + toward)))
+        specular = self.with_fresnel(strength, more, dr.dot(si.wi, dr.normalize(si.wi + toward)))
         return si.to_world(toward), [specular * factor for factor in factors]
 
     def gloss_probabilities(self, ctx, si, here):
@@ -228,7 +244,7 @@ class CookTorrance(mi.BSDF):
         has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
         has_gloss = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
         d = dr.detach(dr.pi * dr.mean(mi.unpolarized_spectrum(here.diffuse)))
-        bounds = [dr.detach(4 * self.with_fresnel(strength, si.wi.z)) for strength, _ in self.glosses(here)]
+        bounds = [dr.detach(4 * self.with_fresnel(strength, more, si.wi.z)) for strength, more, _ in self.glosses(here)]
         s = sum(bounds[1:], bounds[0])
         both = dr.select(d + s > 0, s / (d + s), 0.5)
         if not (has_diffuse and has_gloss):
@@ -245,7 +261,7 @@ class CookTorrance(mi.BSDF):
         """
         h = dr.normalize(wo + si.wi)
         pdf = (1 - sum(probabilities[1:], probabilities[0])) * mi.warp.square_to_cosine_hemisphere_pdf(wo)
-        for probability, (_, r) in zip(probabilities, self.glosses(here)):
+        for probability, (*_, r) in zip(probabilities, self.glosses(here)):
             facets = microfacets(self.distribution, r)
             # The density of visible normals is D G₁ (o·h) / (n·o), the Jacobian of the reflection 1 / (4 (o·h)).
             pdf += probability * (facets.eval(h) * facets.smith_g1(si.wi, h) / (4 * si.wi.z))

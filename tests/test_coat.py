@@ -1,0 +1,176 @@
+"""The coat of `cooktorrance`, a second lobe; fits that find one, and files that keep it."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers.microfacets import CONTEXT, direction, directions, draw, evaluate, interaction, twin, vectors
+
+from mi_ring.scene.mesh_attributes import attributes_of, require_attributes
+
+BASE, COAT = ([0.2, 0.12, 0.05], 0.04, 0.5), (0.03, 0.12)  #: (diffuse, specular, roughness), (strength, roughness)
+BLACK = [0.0, 0.0, 0.0]
+VIEWERS = {"normal": direction(0, 0), "oblique": direction(50, -37), "grazing": direction(80, 110)}
+DISTRIBUTIONS = ["ggx", "beckmann"]
+
+every_distribution = pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+every_viewer = pytest.mark.parametrize("viewer", VIEWERS.values(), ids=VIEWERS)
+
+
+def coated(diffuse=BASE[0], specular=BASE[1], roughness=BASE[2], coat=COAT[0], coat_roughness=COAT[1], **more):
+    colour = {"type": "rgb", "value": list(diffuse)}
+    return mi.load_dict({"type": "cooktorrance", "diffuse": colour, "specular": specular, "roughness": roughness,
+                         "coat": coat, "coat_roughness": coat_roughness, **more})  # fmt: skip
+
+
+def expected(i, o, diffuse, specular, roughness, coat, coat_roughness, distribution="ggx"):
+    """The base and the coat, each by equation 1."""
+    base = twin(i, o, diffuse, specular, roughness, distribution)
+    return base + twin(i, o, BLACK, coat, coat_roughness, distribution)
+
+
+def near_mirror(o, seed, spread=0.15):
+    """Directions (N, 3) near those that mirror `o`: the coat's highlight; float32, above the surface."""
+    i = o * [-1, -1, 1] + np.random.default_rng(seed).normal(0, spread, o.shape)
+    i[:, 2] = np.abs(i[:, 2]) + 0.05
+    return (i / np.linalg.norm(i, axis=1, keepdims=True)).astype(np.float32).astype(float)
+
+
+@every_distribution
+def test_it_is_a_second_lobe_on_top_of_equation_1(distribution):
+    o = directions(600, 31)
+    for i in (directions(600, 32), near_mirror(o, 33)):
+        bsdf = coated(distribution=distribution)
+        value = evaluate(bsdf, i, o)
+        np.testing.assert_allclose(value, expected(i, o, *BASE, *COAT, distribution), rtol=3e-5, atol=1e-7)
+        np.testing.assert_allclose(value / i[:, 2:], evaluate(bsdf, o, i) / o[:, 2:], rtol=2e-5, atol=1e-7)
+
+
+def test_a_coat_of_no_strength_changes_nothing():
+    i, o = directions(300, 34), directions(300, 35)
+    colour = {"type": "rgb", "value": BASE[0]}
+    plain = mi.load_dict({"type": "cooktorrance", "diffuse": colour, "specular": BASE[1], "roughness": BASE[2]})
+    np.testing.assert_array_equal(evaluate(coated(coat=0.0), i, o), evaluate(plain, i, o))
+    assert not any("coat" in key for key, _ in mi.traverse(plain))
+
+
+def test_with_fresnel_both_lobes_together_grow_up_to_a_mirror():
+    """By Schlick's formula with F₀ = 4 (0.01 + 0.03), a quarter of which is the first lobe's."""
+    o = directions(300, 36)
+    i = near_mirror(o, 37)
+    h = (i + o) / np.linalg.norm(i + o, axis=1, keepdims=True)
+    value = evaluate(coated(BLACK, 0.01, 0.5, 0.03, 0.3, fresnel=True), i, o)
+    schlick = 0.16 + 0.84 * (1 - (h * o).sum(1, keepdims=True)) ** 5
+    mirror = twin(i, o, BLACK, 0.25 / 4, 0.5) + twin(i, o, BLACK, 0.75 / 4, 0.3)
+    np.testing.assert_allclose(value, schlick * mirror, rtol=2e-4)
+    coat_alone = evaluate(coated(BLACK, 0.0, 0.5, 0.04, 0.3, fresnel=True), i, o)
+    np.testing.assert_allclose(coat_alone, schlick * twin(i, o, BLACK, 0.25, 0.3), rtol=2e-4)
+
+
+@every_viewer
+@every_distribution
+@pytest.mark.parametrize("fresnel", [False, True])
+def test_samples_follow_the_density(distribution, viewer, fresnel):
+    xml = (f'<rgb name="diffuse" value="{", ".join(map(str, BASE[0]))}"/><float name="specular" value="{BASE[1]}"/>'
+           f'<float name="roughness" value="{BASE[2]}"/><float name="coat" value="{COAT[0]}"/>'
+           f'<float name="coat_roughness" value="{COAT[1]}"/><string name="distribution" value="{distribution}"/>'
+           f'<boolean name="fresnel" value="{str(fresnel).lower()}"/>')  # fmt: skip
+    sample, pdf = mi.chi2.BSDFAdapter("cooktorrance", xml, wi=viewer.tolist())
+    test = mi.chi2.ChiSquareTest(
+        mi.chi2.SphericalDomain(), sample, pdf, sample_dim=3, sample_count=400_000, res=101, ires=16
+    )
+    assert test.run(significance_level=0.01, test_count=12, quiet=True), test.messages
+
+
+@every_viewer
+@every_distribution
+def test_sampling_gives_the_sum_of_the_albedos(distribution, viewer):
+    """Those of bases without a coat, which other tests compare with integrals. It is at most π ρᵈ + 4 ρᵞ + 4 ρᶜ."""
+    count = 200_000
+
+    def albedo(bsdf):
+        weight = np.array(draw(bsdf, viewer, count)[1]).T
+        return weight.mean(0), weight.std(0) / np.sqrt(count)
+
+    colour = {"type": "rgb", "value": BASE[0]}
+    kind = {"type": "cooktorrance", "distribution": distribution}
+    base = mi.load_dict({**kind, "diffuse": colour, "specular": BASE[1], "roughness": BASE[2]})
+    coat = mi.load_dict({**kind, "diffuse": {"type": "rgb", "value": 0}, "specular": COAT[0], "roughness": COAT[1]})
+    (both, noise), (one, _), (other, _) = (albedo(b) for b in (coated(distribution=distribution), base, coat))
+    np.testing.assert_allclose(both, one + other, atol=float(5 * noise.max()))
+    assert (both - 4 * noise <= np.pi * np.array(BASE[0]) + 4 * BASE[1] + 4 * COAT[0]).all()
+
+
+def test_sample_and_eval_pdf_agree_with_eval_and_pdf():
+    bsdf, o, count = coated(), VIEWERS["oblique"], 5000
+    bs, weight = draw(bsdf, o, count)
+    si, seen = interaction(np.repeat(o[None], count, 0)), np.array(bs.pdf) > 0
+    value, pdf = bsdf.eval_pdf(CONTEXT, si, bs.wo)
+    np.testing.assert_array_equal(np.array(value), np.array(bsdf.eval(CONTEXT, si, bs.wo)))
+    np.testing.assert_array_equal(np.array(pdf), np.array(bsdf.pdf(CONTEXT, si, bs.wo)))
+    np.testing.assert_allclose(np.array(bs.pdf)[seen], np.array(pdf)[seen], rtol=1e-5)
+    np.testing.assert_allclose(np.array(weight * bs.pdf)[:, seen], np.array(value)[:, seen], rtol=1e-5, atol=1e-7)
+
+
+@every_distribution
+def test_gradients_are_the_differences_of_both_lobes(distribution):
+    o = directions(400, 38)
+    i = near_mirror(o, 39)
+    w = np.random.default_rng(40).uniform(0.1, 1, (400, 3))
+    bsdf = coated(distribution=distribution)
+    names = "specular", "roughness", "coat", "coat_roughness"
+    params = mi.traverse(bsdf)
+    leaves = [params[f"{name}.value"] for name in names]
+    dr.enable_grad(leaves)
+    params.update()
+    dr.backward(dr.sum(dr.dot(bsdf.eval(CONTEXT, interaction(o), vectors(i)), vectors(w))))
+    for k, leaf in enumerate(leaves):
+        high, low = ([*BASE[1:], *COAT] for _ in range(2))
+        step = 1e-4 * high[k]
+        high[k] += step
+        low[k] -= step
+        ends = [(w * expected(i, o, BASE[0], *values, distribution)).sum() for values in (high, low)]
+        assert float(dr.grad(leaf)[0]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=2e-4), names[k]
+
+
+def test_gradients_through_sampling_are_those_of_the_albedo():
+    """The albedo grows by 4 with the strength of a narrow coat, seen from above: the choice of lobes does not count."""
+    bsdf = coated(coat_roughness=0.05)
+    params = mi.traverse(bsdf)
+    leaves = params["coat.value"], params["specular.value"]
+    dr.enable_grad(*leaves)
+    params.update()
+    dr.backward(dr.mean(draw(bsdf, VIEWERS["normal"], 400_000)[1].x))
+    assert float(dr.grad(leaves[0])[0]) == pytest.approx(4, rel=0.02)
+    assert 2 < float(dr.grad(leaves[1])[0]) < 4  # a wide lobe loses light below the horizon, and between microfacets
+
+
+@pytest.mark.parametrize("cosine", [0.97, 0.4])
+def test_its_lobe_reflects_harmonics_as_a_first_lobe_of_its_strength_and_width(cosine):
+    sine = float(np.sqrt(1 - cosine**2))
+    si = dr.zeros(mi.SurfaceInteraction3f, 1)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.wi = mi.Vector3f(0.6 * sine, -0.8 * sine, cosine)
+
+    def numbers(lobe):
+        return np.concatenate([np.array(lobe[0]).ravel(), *(np.array(factor).ravel() for factor in lobe[1])])
+
+    colour = {"type": "rgb", "value": BASE[0]}
+    alone = mi.load_dict({"type": "cooktorrance", "diffuse": colour, "specular": COAT[0], "roughness": COAT[1]})
+    base = mi.load_dict({"type": "cooktorrance", "diffuse": colour, "specular": BASE[1], "roughness": BASE[2]})
+    matte, gloss, coat = coated().lobes(si, 4)
+    np.testing.assert_allclose(numbers(coat), numbers(alone.lobes(si, 4)[1]), rtol=1e-6)
+    for ours, theirs in zip((matte, gloss), base.lobes(si, 4)):
+        np.testing.assert_array_equal(numbers(ours), numbers(theirs))
+
+
+def test_it_is_read_from_the_mesh_only_if_the_bsdf_says_so():
+    def shape(bsdf):
+        return mi.load_dict({"type": "shapenet", "subdivisions": 0, "bsdf": {"type": "cooktorrance", **bsdf}})
+
+    assert not any("coat" in name for name in attributes_of(shape({}).bsdf()))
+    with pytest.raises(Exception, match='reads the mesh attribute "vertex_coat_roughness", which the shape does not'):
+        shape({"coat": 0.02})
+    with pytest.raises(Exception, match='reads the mesh attribute "vertex_coat", which the shape does not'):
+        shape({"coat_roughness": 0.2})
+    require_attributes(shape({"coat": 0.02, "coat_roughness": 0.2}))
