@@ -1,12 +1,26 @@
 """The coat of `cooktorrance`, a second lobe; fits that find one, and files that keep it."""
 
+import dataclasses
+import shutil
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import torch
+from conftest import AXES, CENTER
 from helpers.microfacets import CONTEXT, direction, directions, draw, evaluate, interaction, twin, vectors
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from mi_ring.capture.loading import load_capture
+from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.fitting.config import Config
+from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.lobe_selection import ENOUGH
+from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.scene.mesh_attributes import attributes_of, require_attributes
+from mi_ring.system import machine
 
 BASE, COAT = ([0.2, 0.12, 0.05], 0.04, 0.5), (0.03, 0.12)  #: (diffuse, specular, roughness), (strength, roughness)
 BLACK = [0.0, 0.0, 0.0]
@@ -174,3 +188,73 @@ def test_it_is_read_from_the_mesh_only_if_the_bsdf_says_so():
     with pytest.raises(Exception, match='reads the mesh attribute "vertex_coat", which the shape does not'):
         shape({"coat_roughness": 0.2})
     require_attributes(shape({"coat": 0.02, "coat_roughness": 0.2}))
+
+
+# Fits.
+
+SMALL = Config(iterations=40, levels=(3,), widths=(56,), shares=(1,), batch=4, detail="none", refine=("none",),
+               indirect=False, subdivisions=3)  # fmt: skip
+ONE, TWO = [(0.03, 0.35)], [(0.03, 0.5), (0.012, 0.12)]  #: lobes: (strength, roughness)
+
+
+def glossy(scene, folder, lobes):
+    """A copy of the small capture whose ellipsoid has these lobes as well, by rays and normals in closed form."""
+    shutil.copytree(scene.parent, folder)
+    turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+    for shot in load_capture(scene).shots:
+        width, height = shot.size
+        v, u = np.mgrid[:height, :width] + 0.5
+        rays = shot.camera.directions(np.stack([u.ravel(), v.ravel()], 1))
+        start, along = (shot.camera.position - CENTER) @ turn / AXES, rays @ turn / AXES
+        a, b, c = (along**2).sum(1), along @ start, start @ start - 1
+        inside = b**2 > a * c
+        away = (-b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a
+        on_sphere = start + away[:, None] * along
+        normals = on_sphere / AXES @ turn.T
+        toward = shot.light.vector - (CENTER + (on_sphere * AXES) @ turn.T)
+        n, i, o = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (normals, toward, -rays))
+        frames = np.linalg.qr(np.concatenate([n[..., None], np.repeat(np.eye(3)[None], len(n), 0)], -1))[0]
+        frames[..., 0] *= np.sign((frames[..., 0] * n).sum(1))[:, None]
+        local = [np.einsum("nij,ni->nj", frames, x)[:, [1, 2, 0]] for x in (i, o)]
+        local = [x * [1, 1, 0] + np.maximum(x, 0.05) * [0, 0, 1] for x in local]
+        irradiance = float(shot.light.rgb[0]) / (toward**2).sum(1)
+        gloss = sum(twin(*local, BLACK, *lobe) for lobe in lobes) * irradiance[:, None]
+        path = folder / "images" / shot.file_name
+        radiance = srgb_to_linear(np.asarray(Image.open(path)) / 255)
+        radiance += np.where(inside[:, None], gloss, 0).reshape(height, width, 3)
+        Image.fromarray(to_bytes(linear_to_srgb(radiance))).save(path)
+    return folder / scene.name
+
+
+@pytest.fixture(scope="module")
+def fits(small_capture, tmp_path_factory):
+    """Fits of the same object with one lobe and with two."""
+    folder = tmp_path_factory.mktemp("glossy")
+    result = []
+    with machine.threads_of(1):
+        for name, lobes in (("one", ONE), ("two", TWO)):
+            done = Fit(load_capture(glossy(small_capture, folder / name, lobes)), SMALL)
+            done.run()
+            result.append(done)
+    return result
+
+
+def test_a_fit_adds_a_second_lobe_where_photographs_show_one(fits):
+    one, two = fits
+    print(one.course.lobes, two.course.lobes)
+    assert one.course.lobes["share"] < 0.5 * ENOUGH and two.course.lobes["share"] > 1.5 * ENOUGH
+    assert [p.name for p in one.ring.brdf_net.bsdf_parameters][-1] == "diffuse_roughness"
+    assert [p.name for p in two.ring.brdf_net.bsdf_parameters][-2:] == ["coat", "coat_roughness"]
+    with torch.no_grad():
+        found = {name: float(value.mean()) for name, value in two.ring.material(two.ring.domain.sample(3)[0]).items()}
+    widths = sorted([found["roughness"], found["coat_roughness"]])
+    assert widths[0] < 0.25 and widths[1] > 0.3
+
+
+def test_a_fit_that_looked_for_a_second_lobe_in_vain_is_the_same_as_without(fits):
+    with machine.threads_of(1):
+        plain = Fit(fits[0].problem.given, dataclasses.replace(SMALL, lobes="1"))
+        plain.run()
+    ours, theirs = (fit.ring.state_dict() for fit in (fits[0], plain))
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert plain.course.lobes == {}

@@ -28,7 +28,7 @@ MOST, WIDTH, SPP = 12, 128, 4  #: photographs that are compared, their largest w
 FEWEST = 4, 50  #: photographs with a highlight, and pixels of it
 RIDGE = 1e-6  #: relative to the diagonal of the normal equations
 ENOUGH = 0.2  #: a second lobe is added if it explains more than this share of the errors near highlights
-MATTE, GLOSS, LOBES = 3, 2, len(WIDTHS)  #: numbers of columns of `moments_of`
+BASE = 3  #: number of columns of the first lobe and of matte light
 
 
 class Evidence(NamedTuple):
@@ -138,8 +138,9 @@ def group_moments(
         lobes = [picture(**one, roughness=black["roughness"] + width)[0] for width in WIDTHS]
     finally:
         surface.write_arrays({f"vertex_{name}": value for name, value in own.items()})
-    columns = torch.stack([matte, gloss, wider - gloss, *lobes])
-    wide = lobes[3].amax(-1)
+    # Grey, because lobes are: a coloured highlight would look like an error.
+    columns = torch.stack([matte, gloss, wider - gloss, *lobes]).mean(-1)
+    observed, whole, wide = observed.cpu().mean(-1), whole.mean(-1), columns[BASE + 3]
     pixels = seen.surely(coverage) & ~seen.clipped.any(-1) & (wide > NEAR * wide.amax((1, 2), keepdim=True))
     floor = FLOOR * problem.exposure
     return [moments_of(observed[n][inside], whole[n][inside], columns[:, n, inside], floor)
@@ -149,25 +150,21 @@ def group_moments(
 def moments_of(observed: Tensor, predicted: Tensor, columns: Tensor, floor: float) -> Tensor:
     """Sum products of the columns and the error, which is the last. Returns (k + 1, k + 1), a mean over n pixels.
 
-    `observed`, `predicted` (n, 3): linear radiance. `columns` (c, n, 3): radiance that the prediction may have more:
-    matte light, first lobe, change of its width, lobes. Matte light is one column for each colour. All are relative to
-    the larger radiance, plus `floor`.
+    `observed`, `predicted` (n,): radiance. `columns` (k, n): radiance that the prediction may have more. All are
+    relative to the larger radiance, plus `floor`.
     """
-    weights = 1 / (torch.maximum(observed, predicted) + floor)
-    matte = torch.diag_embed(columns[0])  # (n, colours, columns)
-    both = torch.cat([matte, columns[1:].movedim(0, -1), (observed - predicted)[..., None]], -1) * weights[..., None]
-    rows = both.reshape(-1, both.shape[-1]).double()
-    return rows.T @ rows / len(observed)
+    rows = torch.cat([columns, (observed - predicted)[None]]) / (torch.maximum(observed, predicted) + floor)
+    return rows.double() @ rows.T.double() / len(observed)
 
 
 def judged(moments: Tensor) -> Evidence:
     """Judge by sums (P, k + 1, k + 1) over pixels of P photographs, results of `moments_of`, in two halves."""
     halves = moments[0::2].sum(0), moments[1::2].sum(0)
-    base = list(range(MATTE + GLOSS))
+    base = list(range(BASE))
     without = [rest(test, base, solution(fitted, base)) for fitted, test in (halves, halves[::-1])]
     found = []
     for k, width in enumerate(WIDTHS):
-        more = [*base, MATTE + GLOSS + k]
+        more = [*base, BASE + k]
         solved = [solution(fitted, more) for fitted in halves]
         left = [rest(test, more, own) for own, test in zip(solved, halves[::-1])]
         share = 1 - sum(left) / max(sum(without), 1e-30)
