@@ -22,13 +22,14 @@ from mi_ring.rendering.surface import Surface
 
 WIDTHS = 0.05, 0.1, 0.2, 0.35, 0.6  #: roughnesses that a second lobe may have
 NEAR = 0.05  #: pixels near a highlight: where a lobe of the roughness 0.35 is above this share of its peak
-WIDER = 1.2  #: factor of the first lobe's roughness, for the derivative with respect to it
+#: Factors of the first lobe's roughness. Its own width may be wrong, above all early in a fit.
+FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0
 FLOOR = 0.1  #: radiance that is added before errors are made relative, in units of the mean of the object
 MOST, WIDTH, SPP = 12, 128, 4  #: photographs that are compared, their largest width [px], and samples per pixel
 FEWEST = 4, 50  #: photographs with a highlight, and pixels of it
 RIDGE = 1e-6  #: relative to the diagonal of the normal equations
-ENOUGH = 0.2  #: a second lobe is added if it explains more than this share of the errors near highlights
-BASE = 3  #: number of columns of the first lobe and of matte light
+ENOUGH = 0.03  #: a second lobe is added if it explains more than this share of the errors near highlights
+FIRST, SECOND = 1, 1 + len(FACTORS)  #: the columns of lobes begin here; before them is matte light
 
 
 class Evidence(NamedTuple):
@@ -91,9 +92,9 @@ def begin_coat(ring: FittedObject, found: Evidence) -> None:
 def evidence(problem: Problem, model: Model, renderer: Renderer, capture: Capture) -> Evidence:
     """Measure how much better a second lobe would explain the photographs.
 
-    The surface and the first lobe stay, except that the first may be stronger or wider. The strength of a second lobe,
-    the same everywhere, follows by least squares for each of several roughnesses. Half of the photographs decide, the
-    other half tells which share of the errors goes; then the halves change places.
+    The surface stays, while the first lobe may be stronger, narrower or wider. The strength of a second lobe, the same
+    everywhere, follows by least squares for each of several roughnesses. Half of the photographs decide, the other half
+    tells which share of the errors goes; then the halves change places.
     """
     chosen = problem.fitted[np.unique(np.linspace(0, len(problem.fitted) - 1, MOST).round().astype(int))]
     level = min(problem.config.levels[0], 4)
@@ -132,15 +133,14 @@ def group_moments(
         whole, coverage = picture(model.ring.indirect)
         matte, _ = picture(specular=black["specular"])
         without = {"diffuse": black["diffuse"]}
-        gloss, _ = picture(**without)
-        wider, _ = picture(**without, roughness=WIDER * own["roughness"])
+        gloss = [picture(**without, roughness=factor * own["roughness"])[0] for factor in FACTORS]
         one = {**without, "specular": black["specular"] + 1}
         lobes = [picture(**one, roughness=black["roughness"] + width)[0] for width in WIDTHS]
     finally:
         surface.write_arrays({f"vertex_{name}": value for name, value in own.items()})
     # Grey, because lobes are: a coloured highlight would look like an error.
-    columns = torch.stack([matte, gloss, wider - gloss, *lobes]).mean(-1)
-    observed, whole, wide = observed.cpu().mean(-1), whole.mean(-1), columns[BASE + 3]
+    columns = torch.stack([matte, *gloss, *lobes]).mean(-1)
+    observed, whole, wide = observed.cpu().mean(-1), whole.mean(-1), columns[SECOND + WIDTHS.index(0.35)]
     pixels = seen.surely(coverage) & ~seen.clipped.any(-1) & (wide > NEAR * wide.amax((1, 2), keepdim=True))
     floor = FLOOR * problem.exposure
     return [moments_of(observed[n][inside], whole[n][inside], columns[:, n, inside], floor)
@@ -160,17 +160,30 @@ def moments_of(observed: Tensor, predicted: Tensor, columns: Tensor, floor: floa
 def judged(moments: Tensor) -> Evidence:
     """Judge by sums (P, k + 1, k + 1) over pixels of P photographs, results of `moments_of`, in two halves."""
     halves = moments[0::2].sum(0), moments[1::2].sum(0)
-    base = list(range(BASE))
-    without = [rest(test, base, solution(fitted, base)) for fitted, test in (halves, halves[::-1])]
+    left = [0.0, 0.0]  # by one lobe, and by two
+    for fitted, test in (halves, halves[::-1]):
+        for n, second in enumerate((False, True)):
+            which, solved = best(fitted, second)
+            left[n] += rest(test, which, solved)
+    which, solved = best(moments.sum(0), True)
+    if which[-1] < SECOND:
+        return Evidence()
+    return Evidence(1 - left[1] / max(left[0], 1e-30), float(solved[-1]), WIDTHS[which[-1] - SECOND])
+
+
+def best(moments: Tensor, second: bool) -> tuple[list[int], Tensor]:
+    """Find the columns that leave the least squared error, and their factors. `moments` (k + 1, k + 1).
+
+    They are matte light, a first lobe between two neighbouring widths and, if it is positive and `second`, another.
+    """
     found = []
-    for k, width in enumerate(WIDTHS):
-        more = [*base, BASE + k]
-        solved = [solution(fitted, more) for fitted in halves]
-        left = [rest(test, more, own) for own, test in zip(solved, halves[::-1])]
-        share = 1 - sum(left) / max(sum(without), 1e-30)
-        strengths = [float(own[-1]) for own in solved]
-        found.append(Evidence(share if min(strengths) > 0 else 0.0, sum(strengths) / 2, width))
-    return max(found)
+    for k in range(FIRST, SECOND - 1):
+        for more in [[], *([n] for n in range(SECOND, SECOND + len(WIDTHS)) if second)]:
+            which = [0, k, k + 1, *more]
+            solved = solution(moments, which)
+            if not more or solved[-1] > 0:
+                found.append((rest(moments, which, solved), which, solved))
+    return min(found, key=lambda one: one[0])[1:]
 
 
 def solution(moments: Tensor, which: list[int]) -> Tensor:
