@@ -51,7 +51,9 @@ def material_numbers(run: Path) -> list[str]:
         found = {name: value.numpy() for name, value in ring.material(ring.domain.sample(LEVEL)[0]).items()}
     albedo, coat = found["diffuse"].mean(1), found.get("coat")
     together = np.corrcoef(albedo, found["specular"])[0, 1]
-    mean = "–" if coat is None else f"{coat.mean() / found['specular'].mean():.2f}, {found['coat_roughness'].mean():.2f}"
+    mean = "–"
+    if coat is not None:
+        mean = f"{coat.mean() / found['specular'].mean():.2f}, {found['coat_roughness'].mean():.2f}"
     return [f"{albedo.std() / albedo.mean():.3f}", f"{together:.2f}", mean]
 
 

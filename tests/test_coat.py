@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mi_ring.capture.loading import load_capture
 from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.fitting import schedule
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.lobe_selection import ENOUGH
@@ -236,7 +237,8 @@ def fits(small_capture, tmp_path_factory):
     turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
     trimesh.Trimesh(CENTER + ball.vertices * AXES @ turn.T, ball.faces).export(folder / "start.ply")
     config = dataclasses.replace(SMALL, domain=("mesh", folder / "start.ply"))
-    with machine.threads_of(1):
+    with machine.threads_of(1), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule, "EARLIEST", BEFORE)
         one, two = (Fit(load_capture(glossy(small_capture, folder / name, lobes)), config)
                     for name, lobes in (("one", ONE), ("two", TWO)))  # fmt: skip
         while one.iteration < BEFORE + 2:

@@ -28,7 +28,7 @@ FLOOR = 0.1  #: radiance that is added before errors are made relative, in units
 MOST, WIDTH, SPP = 12, 128, 4  #: photographs that are compared, their largest width [px], and samples per pixel
 FEWEST = 4, 50  #: photographs with a highlight, and pixels of it
 RIDGE = 1e-6  #: relative to the diagonal of the normal equations
-ENOUGH = 0.03  #: a second lobe is added if it explains more than this share of the errors near highlights
+ENOUGH = 0.01  #: a second lobe is added if it explains more than this share of the errors near highlights
 FIRST, SECOND = 1, 1 + len(FACTORS)  #: the columns of lobes begin here; before them is matte light
 
 
@@ -63,7 +63,7 @@ def described(evidence: dict[str, float]) -> str:
     """Describe the evidence for a second lobe in words, for the user."""
     found = Evidence(**evidence)
     decision = "is added" if found.share > ENOUGH else "is not needed"
-    return (f"Highlights: a second lobe {decision}; it explains {max(0.0, found.share):.0%} of what is left near them "
+    return (f"Highlights: a second lobe {decision}; it explains {max(0.0, found.share):.1%} of what is left near them "
             f"in other photographs, and must explain {ENOUGH:.0%} (--lobes)")  # fmt: skip
 
 
@@ -123,19 +123,19 @@ def group_moments(
     own = {name: mi.Float(surface.params[f"{surface.prefix}vertex_{name}"]) for name in names}
     black = {name: 0 * own[name] for name in names}
 
-    def picture(indirect: bool = False, **changed: Any) -> tuple[Tensor, Tensor]:
+    def picture(changed: dict[str, Any], indirect: bool = False) -> tuple[Tensor, Tensor]:
         """Draw the surface with other parameters. Returns (radiance, coverage)."""
         surface.write_arrays({f"vertex_{name}": value for name, value in (own | changed).items()})
         shadows = problem.config.shadows and problem.capture.shadows
         return prediction.draw(surface, photographs, SPP, shadows=shadows, indirect=indirect)
 
     try:
-        whole, coverage = picture(model.ring.indirect)
-        matte, _ = picture(specular=black["specular"])
+        whole, coverage = picture({}, model.ring.indirect)
+        matte, _ = picture({"specular": black["specular"]})
         without = {"diffuse": black["diffuse"]}
-        gloss = [picture(**without, roughness=factor * own["roughness"])[0] for factor in FACTORS]
+        gloss = [picture({**without, "roughness": factor * own["roughness"]})[0] for factor in FACTORS]
         one = {**without, "specular": black["specular"] + 1}
-        lobes = [picture(**one, roughness=black["roughness"] + width)[0] for width in WIDTHS]
+        lobes = [picture({**one, "roughness": black["roughness"] + width})[0] for width in WIDTHS]
     finally:
         surface.write_arrays({f"vertex_{name}": value for name, value in own.items()})
     # Grey, because lobes are: a coloured highlight would look like an error.

@@ -15,6 +15,7 @@ SETTLING = 0.15  #: iterations of the settling stage, as a share of all iteratio
 RAMP = 0.05  #: progress in which a learning rate rises from 0 to full, after its start
 MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
 LOBES_COUNTED = 0.5  #: progress at which a fit decides about a second lobe of highlights
+EARLIEST = 20  #: iterations before that; shorter fits know too little of surface and material
 INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
 
@@ -102,7 +103,7 @@ class Schedule:
 
     def lobes_due(self, iteration: int) -> bool:
         """Test whether lobes are counted before `iteration`, counted from 0, if the fit chooses their number."""
-        return iteration == int(LOBES_COUNTED * self.shaping) > 0
+        return iteration == int(LOBES_COUNTED * self.shaping) >= EARLIEST
 
     def stage(self, iteration: int) -> Stage:
         """Return the stage of `iteration`, counted from 0."""

@@ -80,8 +80,8 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
         w = np.clip(both.sum(1) / below, 0, 1)
         c = np.clip(diffuse / (below * np.maximum(1 - w, 1e-3))[:, None], 0, 1)
         width = np.sqrt(np.maximum(width, MIN_ROUGHNESS))
-        further = (coat, np.sqrt(widths[:, 1])) if gloss.shape[1] > 1 else ()
-        return Material(c, zero, width, w, 25.0, scale, *further)
+        made = Material(c, zero, width, w, 25.0, scale)
+        return made if gloss.shape[1] == 1 else made._replace(coat=coat, coat_roughness=np.sqrt(widths[:, 1]))
     if kind == "diffuse":
         return Material(value("reflectance", 3), zero, zero + 1, zero, 1.0, 1.0)
     if kind == "principled":
