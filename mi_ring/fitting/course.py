@@ -48,5 +48,5 @@ class Course:
             "weights": it.weights, "learning_rate": learning_rate,
             "stage": it.context.schedule.stages.index(it.stage) + 1, "vertices": len(it.batch.points),
             "crossing": regulariser.crossing, "unexplained": regulariser.unexplained,
-            **({"second_lobe": self.lobes["share"]} if self.lobes else {}),
+            **({"second_lobe": self.lobes["gain"]} if self.lobes else {}),
         })  # fmt: skip
