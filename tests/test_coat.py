@@ -258,13 +258,13 @@ def fits(small_capture, tmp_path_factory):
 
 def test_a_fit_adds_a_second_lobe_where_photographs_show_one(fits):
     one, two = fits
-    assert one.course.lobes["gain"] < ENOUGH and two.course.lobes["gain"] > 1.5 * ENOUGH
+    assert one.course.lobes["gain"] < 0.5 * ENOUGH and two.course.lobes["gain"] > 1.3 * ENOUGH
     assert [p.name for p in one.ring.brdf_net.bsdf_parameters][-1] == "diffuse_roughness"
     assert [p.name for p in two.ring.brdf_net.bsdf_parameters][-2:] == ["coat", "coat_roughness"]
     with torch.no_grad():
         found = {name: float(value.mean()) for name, value in two.ring.material(two.ring.domain.sample(3)[0]).items()}
     widths = sorted([found["roughness"], found["coat_roughness"]])
-    assert widths[0] < 0.2 and widths[1] > 0.25
+    assert widths[0] < 0.2 and widths[1] > 1.5 * widths[0]
 
 
 def test_a_fit_that_looked_for_a_second_lobe_in_vain_is_the_same_as_without(fits):

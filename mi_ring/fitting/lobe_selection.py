@@ -31,7 +31,7 @@ FEWEST = 4, 50  #: photographs with a highlight, and pixels of it
 RIDGE = 1e-6  #: relative to the diagonal of the normal equations
 #: A second lobe is added if it explains more than this share of the light near highlights. It was 0.014 to 0.11 for
 #: varnish and metallic paint, at most 0.004 for plastics with one lobe.
-ENOUGH = 0.01
+ENOUGH = 0.008
 FIRST, SECOND = 1, 1 + len(FACTORS)  #: the columns of lobes begin here; before them is matte light
 
 
@@ -67,7 +67,7 @@ def described(evidence: dict[str, float]) -> str:
     found = Evidence(**evidence)
     decision = "is added" if found.gain > ENOUGH else "is not needed"
     return (f"Highlights: a second lobe {decision}; it explains {found.gain:.1%} of the light near them that no single "
-            f"lobe does, and must explain {ENOUGH:.0%} (--lobes)")  # fmt: skip
+            f"lobe does, and must explain {ENOUGH:.1%} (--lobes)")  # fmt: skip
 
 
 def takes_coat(ring: FittedObject) -> bool:
