@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import mitsuba as mi
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.reflectance import add_coat
@@ -56,8 +56,7 @@ def select_lobes(
         return {}
     found = problem.processes.on_first(lambda: evidence(problem, model, renderer, capture))
     if found.gain > ENOUGH:
-        begin_coat(ring, found)
-        optimisation.follow(ring.brdf_net.output.parameters())  # type: ignore[operator, union-attr]
+        optimisation.follow(begin_coat(ring, found))
         renderer.surface = Surface(problem.scene, problem.capture.shape, ring)
     return found._asdict()
 
@@ -79,15 +78,18 @@ def takes_coat(ring: FittedObject) -> bool:
     return own and {"diffuse", "specular", "roughness"} <= names and given == [None, None]
 
 
-def begin_coat(ring: FittedObject, found: Evidence) -> None:
-    """Let an object have a coat, in place, which begins as the evidence says, the same everywhere."""
+def begin_coat(ring: FittedObject, found: Evidence) -> list[tuple[nn.Parameter, nn.Parameter]]:
+    """Let an object have a coat, in place, which begins as the evidence says, the same everywhere.
+
+    Returns pairs (old, larger) of parameters of BRDF-Net.
+    """
     element = ElementTree.fromstring(ring.bsdf)
     add_coat(element)
     ring.bsdf = ElementTree.tostring(element, "unicode")
     strength, width = COAT
     relative = max(found.coat / float(ring.brdf_net.scale), 1e-3)
     starts = relative + math.log(-math.expm1(-relative)), math.log(found.roughness / (1 - found.roughness))
-    ring.brdf_net.add_parameters([  # type: ignore[operator]
+    return ring.brdf_net.add_parameters([  # type: ignore[operator]
         Parameter(p.name, p.channels, p.low, p.high, start) for p, start in zip((strength, width), starts)
     ])  # fmt: skip
 

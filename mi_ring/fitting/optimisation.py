@@ -172,15 +172,19 @@ class Optimisation:
             self.model.calibration.room.forget()
             self.guard.keep()  # so that a retreat does not restore the old equations
 
-    def follow(self, grown: Iterable[Tensor]) -> None:
-        """Continue with parameters that have `grown` by further rows: Adam knows no gradients of these yet."""
-        for tensor in grown:
+    def follow(self, pairs: Iterable[tuple[nn.Parameter, nn.Parameter]]) -> None:
+        """Continue with larger parameters: pairs (old, new with further rows). Adam knows no gradients of these yet."""
+        for old, new in pairs:
             for optimizer in self.optimizers:
-                state = optimizer.state.get(tensor, {})
+                for group in optimizer.param_groups:
+                    group["params"] = [new if p is old else p for p in group["params"]]
+                state = optimizer.state.pop(old, {})
                 for name, value in state.items():
                     if torch.is_tensor(value) and value.ndim:
-                        more = value.new_zeros(len(tensor) - len(value), *value.shape[1:])
+                        more = value.new_zeros(len(new) - len(value), *value.shape[1:])
                         state[name] = torch.cat([value, more])
+                if state:
+                    optimizer.state[new] = state
         self.guard.keep()
 
     def backward(self, loss: Tensor, it: Iteration) -> float:

@@ -124,16 +124,19 @@ class BRDFNet(MLP, MaterialNet):
         self.set_parameters(parameters, scale)
 
     @torch.no_grad()
-    def add_parameters(self, parameters: Sequence[Parameter]) -> None:
+    def add_parameters(self, parameters: Sequence[Parameter]) -> list[tuple[nn.Parameter, nn.Parameter]]:
         """Predict further BSDF parameters, in place. Their outputs are 0 at first: `start` says what they are.
 
+        Returns pairs (old tensor, larger tensor) for optimisers: weight and bias of the last layer are new tensors.
         The tensors of the last layer become larger. `mi_ring.fitting.muon` does not train them.
         """
         self.set_parameters([*self.bsdf_parameters, *parameters], float(self.scale))
-        for tensor in self.output.parameters():
-            more = tensor.new_zeros(self.outputs - len(tensor), *tensor.shape[1:])
-            tensor.data, tensor.grad = torch.cat([tensor.data, more]), None
-        self.output.out_features = self.outputs
+        before, pairs = self.output, []
+        self.output = nn.Linear(before.in_features, self.outputs, device=before.weight.device)
+        for old, new in zip(before.parameters(), self.output.parameters(), strict=True):
+            new.zero_()[: len(old)] = old
+            pairs.append((old, new))
+        return pairs
 
     def arguments(self) -> dict:
         """Return the arguments of the constructor as a dict, to save them.
