@@ -19,7 +19,7 @@ from scipy.optimize import least_squares, nnls
 from scipy.special import expit, logit
 
 import mi_ring  # noqa: F401  (chooses Mitsuba's variant)
-from mi_ring.rendering.bsdf_lobes import DARKER
+from mi_ring.plugins.matte_reflection import DARKER
 
 STEEPEST = np.radians(80)
 HELPED = 10  #: number of materials in the second table

@@ -24,10 +24,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from mi_ring.capture.scenefile import move_names, numbers
+from mi_ring.capture.emitter_elements import numbers
+from mi_ring.capture.scenefile import move_names
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.images import contrasted, linear_to_srgb
-from mi_ring.rendering.bsdf_lobes import DARKER
+from mi_ring.plugins.matte_reflection import DARKER
 
 # isort: split
 import mitsuba as mi

@@ -14,9 +14,10 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
+from mi_ring.capture.emitter_elements import room_element
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.reduction import WIDTH
-from mi_ring.capture.scenefile import room_element, scene_bytes, scene_element
+from mi_ring.capture.scenefile import scene_bytes, scene_element
 from mi_ring.errors import InputError
 from mi_ring.image_headers import SUFFIXES, encodings, image_size
 from mi_ring.importers.formats import detect

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.microfacets import CONTEXT, TWINS, direction, directions, draw, evaluate, interaction, twin, vectors
 
-from mi_ring.rendering.bsdf_lobes import cosine_factors, rough_lobe
+from mi_ring.plugins.matte_reflection import cosine_factors, rough_lobe
 from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.system import machine
 

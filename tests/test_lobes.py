@@ -16,13 +16,14 @@ from helpers.unknown_light import TINY, TOWARD
 import mi_ring
 from mi_ring import synthesize
 from mi_ring.calibration.room_light import LOBE_RIDGE, RIDGE, RoomLight
-from mi_ring.capture.scenefile import room_elements, scene_bytes
+from mi_ring.capture.emitter_elements import room_elements
+from mi_ring.capture.scenefile import scene_bytes
 from mi_ring.fitting import schedule
 from mi_ring.fitting.lighting import Lighting
 from mi_ring.fitting.lobe_search import find_lobes
 from mi_ring.images import write_image
+from mi_ring.plugins.matte_reflection import softened_cosine, zonal_coefficients
 from mi_ring.rendering import indirect_light, lobe_light, prediction
-from mi_ring.rendering.bsdf_lobes import softened_cosine, zonal_coefficients
 from mi_ring.rendering.lobe_light import LobeLight, sample_lobe
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS, envmap_directions, room_envmap
@@ -293,7 +294,7 @@ def test_a_search_finds_a_small_light_and_none_in_smooth_light(in_the_sun, in_an
 
 def test_a_fit_moves_lobes_continues_with_them_and_writes_them(in_the_sun, tmp_path, monkeypatch):
     """From one 10° off. No search helps."""
-    monkeypatch.setattr(schedule, "LOBES_SOUGHT", ())
+    monkeypatch.setattr(schedule, "LIGHTS_SOUGHT", ())
     capture = mi_ring.load_capture(in_the_sun)
     config = mi_ring.Config.preset("fast", **TINY | {"iterations": 3}, light="environment", small_lights=8)
     fit = mi_ring.Fit(capture, config, lighting=Lighting("environment"))

@@ -12,8 +12,9 @@ import torch
 from helpers.lit_cup import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
 
 from mi_ring.calibration.room_light import RoomLight
+from mi_ring.capture.emitter_elements import room_element, room_elements
 from mi_ring.capture.loading import load_capture
-from mi_ring.capture.scenefile import recalibrated_xml, room_element, room_elements, scene_bytes
+from mi_ring.capture.scenefile import recalibrated_xml, scene_bytes
 from mi_ring.rendering import indirect_light
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_photographs

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mi_ring.capture.decoding import is_linear
+from mi_ring.capture.emitter_elements import room_elements
 from mi_ring.capture.pixels import Pixels
-from mi_ring.capture.scenefile import photograph_element, room_elements, scene_bytes, scene_element
+from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.errors import LARGEST, InputError, require_numbers
 from mi_ring.geometry.camera import Camera, usable_camera
 from mi_ring.images import mask_values, write_image

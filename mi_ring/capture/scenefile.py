@@ -9,18 +9,16 @@ from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from mi_ring.capture.emitter_elements import Element, emitter_element, numbers, room_elements
 from mi_ring.errors import InputError
 from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.shapenet import FOR_FITS
-from mi_ring.rendering.spherical_harmonics import BASIS, MAX_ORDER, PER_FRAME
+from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.scene.lights import Light
 from mi_ring.scene.lobes import Lobes
 from mi_ring.scene.shot import Files, Shot
 from mi_ring.system.files import relative_to
-
-Element = ElementTree.Element
 
 #: Properties of plugins that name a file. Values of other properties may look like file names.
 FILES = "filename", "mask", "valid", "ambient", "domain", "weights"
@@ -112,18 +110,6 @@ def scene_bytes(root: Element) -> bytes:
     return ElementTree.tostring(root, "utf-8")
 
 
-def emitter_element(light: Light) -> Element:
-    """Make the XML element of a light: an emitter of type `point` or `directional`."""
-    emitter = ElementTree.Element("emitter", type=light.kind)
-    tag, where, strength = {
-        "point": ("point", "position", "intensity"), "directional": ("vector", "direction", "irradiance")
-    }[light.kind]  # fmt: skip
-    x, y, z = (numbers(v) for v in light.vector)
-    ElementTree.SubElement(emitter, tag, name=where, x=x, y=y, z=z)
-    ElementTree.SubElement(emitter, "rgb", name=strength, value=numbers(light.rgb))
-    return emitter
-
-
 def perspective_element(camera: Camera, points: np.ndarray) -> Element:
     """Make the XML of a camera as Mitsuba's sensor `perspective`. Lens distortion is left out.
 
@@ -157,11 +143,6 @@ def add_film(sensor: Element, width: int, height: int) -> None:
     film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
     for name, pixels in (("width", width), ("height", height)):
         ElementTree.SubElement(film, "integer", name=name, value=str(pixels))
-
-
-def numbers(values: ArrayLike) -> str:
-    """Format numbers as text for XML, separated by spaces."""
-    return " ".join(f"{v:.9g}" for v in np.ravel(values))
 
 
 def recalibrated_xml(
@@ -259,38 +240,6 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
     return [(element, named.get(element.get("id", ""), k)) for k, element in enumerate(elements)]
 
 
-def room_elements(room: np.ndarray, frames: Collection[str] = (), lobes: Lobes | None = None) -> list[Element]:
-    """Make the XML of room light: one element for light that is fixed in world axes, one for light in camera axes.
-
-    `room` (BASIS, 3): spherical harmonics, first in world axes, then in camera axes. An element whose light is black is
-    left out, unless `frames` contains its axes, "world" or "camera". `lobes`: small lights, in either axes.
-    """
-    world, camera = room[:PER_FRAME], np.vstack([np.zeros_like(room[:1]), room[PER_FRAME:]])
-    # Uniform light belongs to either part.
-    if not world[1:].any() and (camera.any() or set(frames) == {"camera"}):
-        world, camera = np.zeros_like(world), camera + np.vstack([room[:1], np.zeros_like(room[PER_FRAME:])])
-    parts = {"world": world, "camera": camera}
-    own = {frame: lobes and lobes.selected(lobes.in_camera == (frame == "camera")) for frame in parts}
-    return [room_element(frame, part, own[frame]) for frame, part in parts.items()
-            if part.any() or frame in frames or own[frame]]  # fmt: skip
-
-
-def room_element(frame: str, harmonics: np.ndarray, lobes: Lobes | None = None) -> Element:
-    """Make the XML of a `room` emitter: light from all around, in the axes `frame`, "world" or "camera".
-
-    `harmonics` (n, 3): real spherical harmonics of its radiance; n at most PER_FRAME. `lobes`: small lights in these
-    axes.
-    """
-    orders = [(order + 1) ** 2 for order in range(2, MAX_ORDER + 1)]
-    harmonics = harmonics[: next(count for count in orders if not harmonics[count:].any())]
-    element = ElementTree.Element("emitter", type="room")
-    ElementTree.SubElement(element, "string", name="frame", value=frame)
-    ElementTree.SubElement(element, "string", name="harmonics", value=numbers(harmonics))
-    if lobes:
-        ElementTree.SubElement(element, "string", name="lobes", value=numbers(lobes.values()))
-    return element
-
-
 def move_names(root: Element, source: Path, folder: Path) -> None:
     """Change the file names in a scene in place. Names relative to the folder `source` become relative to `folder`."""
     for element in root.iter("string"):
@@ -323,11 +272,16 @@ def fitted_scene_xml(path: Path, folder: Path, subdivisions: int, bsdf: str) -> 
     return scene_bytes(root)
 
 
-def at_level(scene: bytes, level: int) -> bytes:
-    """Return the scene file of a fit with another `level` of the object's mesh. `scene`: its content."""
+def updated(scene: bytes, level: int, bsdf: str) -> bytes:
+    """Return the scene file of a fit with another `level` of the object's mesh, and with the XML `bsdf` of its BSDF.
+
+    `scene`: its content.
+    """
     root = ElementTree.fromstring(scene)
     shape = next(e for e in root.iter("shape") if e.get("type") == "shapenet")
     next(e for e in shape if e.get("name") == "subdivisions").set("value", str(level))
+    place = next(k for k, e in enumerate(shape) if e.tag == "bsdf")
+    shape[place] = ElementTree.fromstring(bsdf)
     return scene_bytes(root)
 
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mi_ring.capture.scenefile import Element, photograph_element, scene_bytes, scene_element
+from mi_ring.capture.emitter_elements import Element
+from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.collection.jobs import modified
 from mi_ring.errors import InputError, require_file
 from mi_ring.experiments.datasets import CachedDataset

@@ -116,7 +116,7 @@ class Tuning:
     mesh skips two thirds of the iterations of the first stage. It adds 40 % of the skipped iterations to the second."""
     small_lights: int = 0
     """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
-    Only if the room is the only light. 0: the light is smooth. Give 8 if the light was small and the object is glossy."""
+    Only if the room is the only light. 0: the light is smooth. Give 8 if it was small and the object is glossy."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
     A fit with --detail chooses the level itself, 7 or 8 for most captures.
@@ -183,6 +183,10 @@ class Ablation:
     diffuse: Literal["rough", "lambert"] = "rough"
     """How matte surfaces reflect light. lambert: equally in all directions, as in the paper.
     rough: more toward the light, as wood, cloth and stone do. The fit finds how much, everywhere on the surface."""
+    lobes: Literal["auto", "1", "2"] = "auto"
+    """Number of lobes of the highlights. 1: one at each point, as in the paper.
+    2: a second lobe, the coat. Varnish, glaze and polished metal have a sharp highlight in a wide one.
+    auto: 1, and 2 from the middle of the fit on if the photographs show a second lobe."""
     optimizer: Literal["muon", "adam"] = "muon"
     """The optimisers that train the networks. Set adam to train them as in the paper.
     muon: Muon for the hidden layers, Adam for the other weights. adam: Adam for all weights, as in the paper."""
@@ -315,6 +319,6 @@ PRESETS: dict[str, dict] = {
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
         "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
         "precision": "float32", "domain": "sphere", "masks": "given", "shadows": False, "indirect": False,
-        "refine": ("none",), "detail": "none", "diffuse": "lambert",
+        "refine": ("none",), "detail": "none", "diffuse": "lambert", "lobes": "1",
     },
 }  # fmt: skip

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from mi_ring.capture.capture import Capture, Observation
-from mi_ring.capture.loading import recompute_normals
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.course import Course
 from mi_ring.fitting.iteration import Context, Iteration
 from mi_ring.fitting.lighting import AMBIGUOUS, Lighting
+from mi_ring.fitting.lobe_selection import select_lobes
 from mi_ring.fitting.mask_refinement import find_masks, with_masks
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.optimisation import Optimisation
@@ -70,8 +70,6 @@ class Fit(Renamed):
         if state is not None and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
         lighting, ring = (lighting, None) if state is None else restored(state)
-        if config.deterministic:
-            recompute_normals(capture.scene)
         self.problem = problem = Problem.of(capture, config, lighting or Lighting.of(capture, config))
         torch.manual_seed(config.seed)
         self.model = model = Model(problem, (ring or starting_ring(problem, networks)).to(problem.device))
@@ -105,7 +103,9 @@ class Fit(Renamed):
         started = time.perf_counter()
         if "masks" in self.problem.config.refine and self.schedule.masks_due(self.iteration):
             self.refine_masks()
-        self.optimisation.find_lobes(self.renderer, self.schedule, self.iteration)
+        self.optimisation.find_small_lights(self.renderer, self.schedule, self.iteration)
+        if self.problem.config.lobes == "auto" and self.schedule.lobes_due(self.iteration):
+            self.course.lobes |= select_lobes(self.problem, self.model, self.renderer, self.optimisation, self.capture)
         batch = self.sampler.draw(self.problem, self.schedule, self.ring.domain, self.iteration)
         observation = self.sampler.observe(self.problem, self.capture, batch)
         it = self.optimisation.step(lambda: self.evaluate(batch, observation))

@@ -20,7 +20,8 @@ from mi_ring.system.progress import progress
 
 #: Settings of a coarse fit. They do not depend on those of the fit: neither does the choice.
 COARSE: dict[str, Any] = {
-    "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0, "small_lights": 0, "detail": "none",
+    "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0, "detail": "none",
+    "lobes": "1", "small_lights": 0,
     **{name: getattr(Config(), name) for name in (
         "loss", "optimizer", "learning_rate", "muon_rate", "decay", "velocity_decay", "steps", "spp", "batch")},
 }  # fmt: skip

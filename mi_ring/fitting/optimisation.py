@@ -1,7 +1,7 @@
 """The optimisation: Muon for hidden weights, Adam for all other parameters, and one step of all optimisers."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -188,12 +188,12 @@ class Optimisation:
             self.model.calibration.room.forget()
             self.guard.keep()  # so that a retreat does not restore the old equations
 
-    def find_lobes(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
+    def find_small_lights(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
         """Find the lobes of the room's light anew, if it is time. `iteration`: the next one, from 0."""
         calibration, problem = self.model.calibration, self.problem
         if calibration is None or self.model.detailed or not finds_lobes(calibration, problem.config):
             return
-        if iteration in schedule.lobes_sought:
+        if iteration in schedule.lights_sought:
             level = schedule.stage(iteration).level
             found = problem.processes.on_first(lambda: find_lobes(problem, self.model, renderer, level, iteration))
             found.put_into(calibration.room)
@@ -201,6 +201,21 @@ class Optimisation:
                 for parameter in (calibration.room.toward, calibration.room.log_sharpness):
                     optimizer.state.pop(parameter, None)  # it is of another lobe
             self.guard.keep()  # so that a retreat does not restore the old lobes
+
+    def follow(self, pairs: Iterable[tuple[nn.Parameter, nn.Parameter]]) -> None:
+        """Continue with larger parameters: pairs (old, new with further rows). Adam knows no gradients of these yet."""
+        for old, new in pairs:
+            for optimizer in self.optimizers:
+                for group in optimizer.param_groups:
+                    group["params"] = [new if p is old else p for p in group["params"]]
+                state = optimizer.state.pop(old, {})
+                for name, value in state.items():
+                    if torch.is_tensor(value) and value.ndim:
+                        more = value.new_zeros(len(new) - len(value), *value.shape[1:])
+                        state[name] = torch.cat([value, more])
+                if state:
+                    optimizer.state[new] = state
+        self.guard.keep()
 
     def backward(self, loss: Tensor, it: Iteration) -> float:
         """Backpropagate this process's `loss`, and sum the gradients over all processes.

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from mi_ring.capture.capture import Capture
+from mi_ring.capture.loading import recompute_normals
 from mi_ring.capture.pairs import camera_numbers
 from mi_ring.capture.reduction import WIDTH, reduced
 from mi_ring.errors import InputError
@@ -37,9 +38,13 @@ class Problem:
     def of(cls, capture: Capture, config: Config, lighting: Lighting) -> "Problem":
         """Prepare the problem of a fit. Large photographs are reduced, and some photographs are held out.
 
+        A deterministic fit changes the normals of the scene's meshes.
+
         `lighting`: the light that the fit assumes. Raises InputError if no photograph is left to fit, or if the object
         is black in all photographs.
         """
+        if config.deterministic:
+            recompute_normals(capture.scene)
         given, capture = capture, reduced(capture, max(WIDTH, *config.widths))
         held_out = held_out_photographs(capture, config.holdout)
         fitted = np.setdiff1d(np.arange(len(capture)), held_out)

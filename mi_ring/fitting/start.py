@@ -20,7 +20,7 @@ from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import Refinement
 from mi_ring.geometry.domain import Domain, Sphere, closed_domain
 from mi_ring.geometry.meshes import genus, load_closed_mesh
-from mi_ring.nets.brdf_net import ROUGH, BRDFNet, MaterialNet
+from mi_ring.nets.brdf_net import COAT, ROUGH, BRDFNet, MaterialNet
 from mi_ring.nets.resnet import shape_net_of
 from mi_ring.nets.shape_net import Flow
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial
@@ -89,8 +89,9 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
     domain, center, radius = starting_surface(capture, config.domain)
     require_normalised(capture, domain, center, radius)
     require_view_from_outside(capture, domain, center, radius)
-    rough = predicts_roughness(networks) if networks else config.diffuse == "rough"
-    parameters, bsdf = predicted_parameters(capture, config.parameters, rough)
+    rough = predicts(networks, ROUGH.name) if networks else config.diffuse == "rough"
+    coat = predicts(networks, COAT[0].name) if networks else config.lobes == "2"
+    parameters, bsdf = predicted_parameters(capture, config.parameters, rough, coat)
     if problem.lighting.kind != "capture":
         bsdf = with_fresnel(bsdf)
     reflectance, refined, power = refinement = Refinement.of(problem, center)
@@ -127,10 +128,10 @@ def starting_ring(problem: Problem, networks: tuple[Flow, MaterialNet] | None) -
     return ring
 
 
-def predicts_roughness(networks: object) -> bool:
-    """Return True if the last of the given networks already predicts the roughness of matte surfaces."""
+def predicts(networks: object, name: str) -> bool:
+    """Return True if the last of the given networks already predicts the BSDF parameter `name`."""
     last = networks[-1] if isinstance(networks, Sequence) else None
-    return any(p.name == ROUGH.name for p in getattr(last, "bsdf_parameters", ()))
+    return any(p.name == name for p in getattr(last, "bsdf_parameters", ()))
 
 
 def with_fresnel(bsdf: str) -> str:

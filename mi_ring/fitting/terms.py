@@ -106,7 +106,8 @@ default_terms: dict[str, Term] = {
 }
 WITHOUT_PHOTOGRAPHS = set(default_terms) - {"rgb", "mask"}  #: terms that do not compare with photographs
 #: Names of the log's other entries.
-RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained"}
+RESERVED = {"iteration", "seconds", "loss", "weights", "learning_rate", "stage", "vertices", "crossing", "unexplained",
+            "second_lobe"}  # fmt: skip
 
 
 class Loss:

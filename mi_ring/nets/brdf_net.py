@@ -25,7 +25,8 @@ class Parameter(NamedTuple):
 
 ALBEDO = "diffuse", "reflectance", "diffuse_reflectance", "base_color"  #: Mitsuba's names of the colour without gloss
 #: Mitsuba's names of the strength of highlights, and of their width
-SPECULAR, ROUGHNESS = ("specular", "specular_reflectance"), ("roughness", "alpha")
+SPECULAR = "specular", "specular_reflectance", "coat"
+ROUGHNESS = "roughness", "alpha", "coat_roughness"
 
 #: The paper's five numbers.
 COOK_TORRANCE = (
@@ -35,6 +36,8 @@ COOK_TORRANCE = (
 )
 #: A sixth number: the roughness of the matte part. 0 is the paper's.
 ROUGH = Parameter("diffuse_roughness", 1, 0.0, 1.0, -3.0)
+#: A second specular lobe: strength and width of a coat. Without it, the reflectance is the paper's.
+COAT = Parameter("coat", 1, 0.0, math.inf, -3.0), Parameter("coat_roughness", 1, 0.0, 1.0, -1.5)
 
 
 def albedo_of(parameters: Sequence[Parameter]) -> Parameter | None:
@@ -119,6 +122,21 @@ class BRDFNet(MLP, MaterialNet):
     ) -> None:  # fmt: skip
         super().__init__(5, sum(Parameter(*p).channels for p in parameters), PosEnc(frequencies, encoding))
         self.set_parameters(parameters, scale)
+
+    @torch.no_grad()
+    def add_parameters(self, parameters: Sequence[Parameter]) -> list[tuple[nn.Parameter, nn.Parameter]]:
+        """Predict further BSDF parameters, in place. Their outputs are 0 at first: `start` says what they are.
+
+        Returns pairs (old tensor, larger tensor) for optimisers: weight and bias of the last layer are new tensors.
+        The tensors of the last layer become larger. `mi_ring.fitting.muon` does not train them.
+        """
+        self.set_parameters([*self.bsdf_parameters, *parameters], float(self.scale))
+        before, pairs = self.output, []
+        self.output = nn.Linear(before.in_features, self.outputs, device=before.weight.device)
+        for old, new in zip(before.parameters(), self.output.parameters(), strict=True):
+            new.zero_()[: len(old)] = old
+            pairs.append((old, new))
+        return pairs
 
     def arguments(self) -> dict:
         """Return the arguments of the constructor as a dict, to save them.

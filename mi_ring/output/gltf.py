@@ -15,11 +15,13 @@ from mi_ring.errors import InputError
 from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
-from mi_ring.rendering.bsdf_lobes import DARKER, MEAN, MIN_ROUGHNESS
+from mi_ring.plugins.matte_reflection import DARKER, MEAN
+from mi_ring.plugins.microfacets import MIN_ROUGHNESS
 from mi_ring.scene.mesh_attributes import constant_values
 from mi_ring.scene.visibility import MaskedCamera, visible_points
 from mi_ring.scene.xml_elements import load_bsdf
 
+COAT_F0 = 0.04  #: what a clear coat of glTF reflects, seen from above
 LOBES = ("anisotropic", "clearcoat", "sheen", "spec_trans", "spec_tint", "flatness")  #: of `principled` that glTF lacks
 
 
@@ -32,6 +34,17 @@ class Material(NamedTuple):
     specular: np.ndarray  # (N,), the weight of KHR_materials_specular
     specular_color: float  # the factor of F₀ in this extension
     scale: float  # of the reflectances, so that they stay within [0, 1]
+    coat: np.ndarray | None = None  # (N,), the weight of KHR_materials_clearcoat; None: no coat
+    coat_roughness: np.ndarray | None = None  # (N,), the square root of its microfacet width
+
+
+class Shares(NamedTuple):
+    """What the parts of a `cooktorrance` reflect at N points, relative to the incident light."""
+
+    matte: np.ndarray  # (N, 3) π ρᵈ, of Lambert's law
+    gloss: np.ndarray  # (N, L) 4 ρᵞ of each of L specular lobes
+    widths: np.ndarray  # (N, L) microfacet width of each
+    scale: float  # of the reflectances, so that hardly any sum is above 1
 
 
 def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
@@ -49,30 +62,26 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
     1 % of the points do not conserve energy, the intensities of the lights were wrong. Then all ρ are scaled. glTF has
     no rough matte surfaces: instead of ρᵈ with a `diffuse_roughness`, c has Lambert's ρᵈ of the same mean albedo.
 
+    A coat becomes KHR_materials_clearcoat, which reflects 4 % of the light from above, and more at grazing angles. What
+    is above 4 % is added to the other lobe, whose width then is the mean of both.
+
     ``diffuse`` is exact in glTF. ``principled`` without other lobes is nearly exact. Raises InputError for other BSDFs.
     """
-    loaded = load_bsdf(bsdf)
     kind = ElementTree.fromstring(bsdf).get("type")
-    fixed, params = constant_values(loaded), mi.traverse(loaded)
-    count = len(next(iter(values.values())))
-
-    def value(name: str, channels: int = 1) -> np.ndarray:
-        if name in values:
-            return values[name]
-        if name not in fixed:
-            raise InputError(f"{kind}: {name} is neither fitted nor a constant; write PLY")
-        constant = np.broadcast_to(np.asarray(fixed[name][0], np.float32).ravel(), (count, channels))
-        return constant if channels == 3 else constant[:, 0]
-
-    zero = np.zeros(count, np.float32)
+    value, params = Values(bsdf, values), mi.traverse(load_bsdf(bsdf))
+    zero = np.zeros(value.count, np.float32)
     if kind == "cooktorrance":
-        rough = value("diffuse_roughness") if "diffuse_roughness" in {*values, *fixed} else zero
-        specular = 4 * value("specular")
-        diffuse = math.pi * value("diffuse", 3) * ((1 + MEAN * rough) / (1 + DARKER * rough))[:, None]
-        scale = 1 / max(1.0, float(np.quantile(diffuse.max(1) + specular, 0.99)))
-        w = np.clip(scale * specular, 0, 1)
-        c = np.clip(scale * diffuse / np.maximum(1 - w, 1e-3)[:, None], 0, 1)
-        return Material(c, zero, np.sqrt(np.maximum(value("roughness"), MIN_ROUGHNESS)), w, 25.0, scale)
+        diffuse, gloss, widths, scale = shares(bsdf, values)
+        above = gloss[:, 1:].sum(1)  # 0 without a coat
+        coat = np.minimum(above / COAT_F0, 1)
+        both = np.stack([gloss[:, 0], above - COAT_F0 * coat][: gloss.shape[1]], 1)
+        width = (both * widths).sum(1) / np.maximum(both.sum(1), 1e-12) if gloss.shape[1] > 1 else widths[:, 0]
+        below = 1 - COAT_F0 * coat  # of the light passes the coat
+        w = np.clip(both.sum(1) / below, 0, 1)
+        c = np.clip(diffuse / (below * np.maximum(1 - w, 1e-3))[:, None], 0, 1)
+        width = np.sqrt(np.maximum(width, MIN_ROUGHNESS))
+        made = Material(c, zero, width, w, 25.0, scale)
+        return made if gloss.shape[1] == 1 else made._replace(coat=coat, coat_roughness=np.sqrt(widths[:, 1]))
     if kind == "diffuse":
         return Material(value("reflectance", 3), zero, zero + 1, zero, 1.0, 1.0)
     if kind == "principled":
@@ -83,6 +92,42 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
             return Material(value("base_color", 3), value("metallic"), value("roughness"), zero + 1, f0 / 0.04, 1.0)
         kind = f"principled with {', '.join(further)}"
     raise InputError(f"{kind}: glTF cannot express this material; write PLY or a scene for Mitsuba (.xml)")
+
+
+class Values:
+    """The parameters of a BSDF at N points: values of a fit, or constants. Call it with the name of a parameter.
+
+    `bsdf`: Mitsuba's XML. `values`: parameters by name, (N, 3) or (N,). A call raises InputError if the parameter has
+    no value.
+    """
+
+    def __init__(self, bsdf: str, values: dict[str, np.ndarray]) -> None:
+        self.kind, self.values = ElementTree.fromstring(bsdf).get("type"), values
+        self.fixed = constant_values(load_bsdf(bsdf))
+        self.count = len(next(iter(values.values())))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.values or name in self.fixed
+
+    def __call__(self, name: str, channels: int = 1) -> np.ndarray:
+        if name in self.values:
+            return self.values[name]
+        if name not in self.fixed:
+            raise InputError(f"{self.kind}: {name} is neither fitted nor a constant; write PLY")
+        constant = np.broadcast_to(np.asarray(self.fixed[name][0], np.float32).ravel(), (self.count, channels))
+        return constant if channels == 3 else constant[:, 0]
+
+
+def shares(bsdf: str, values: dict[str, np.ndarray]) -> Shares:
+    """Compute what the parts of a `cooktorrance` reflect. Arguments as those of `metallic_roughness`."""
+    value = Values(bsdf, values)
+    rough = value("diffuse_roughness") if "diffuse_roughness" in value else np.zeros(value.count, np.float32)
+    matte = math.pi * value("diffuse", 3) * ((1 + MEAN * rough) / (1 + DARKER * rough))[:, None]
+    lobes = [("specular", "roughness"), ("coat", "coat_roughness")][: 1 + ("coat" in value)]
+    gloss = np.stack([4 * value(strength) for strength, _ in lobes], 1)
+    widths = np.maximum(np.stack([value(width) for _, width in lobes], 1), MIN_ROUGHNESS)
+    scale = 1 / max(1.0, float(np.quantile(matte.max(1) + gloss.sum(1), 0.99)))
+    return Shares(scale * matte, scale * gloss, widths, scale)
 
 
 def require_expressible(ring: FittedObject) -> None:
@@ -103,6 +148,8 @@ def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
         "specularTexture": to_bytes(np.stack([ones, ones, ones, material.specular], 1)),
         "normalTexture": to_bytes(0.5 * texels.normals + 0.5),
     }
+    if material.coat is not None and material.coat_roughness is not None:
+        images["clearcoatTexture"] = to_bytes(np.stack([material.coat, material.coat_roughness, 0 * ones], 1))
     return {name: image[texels.index] for name, image in images.items()}
 
 
@@ -178,15 +225,22 @@ def assemble_glb(
     bounds.min, bounds.max = positions.min(0).tolist(), positions.max(0).tolist()
     indices = accessor(atlas.faces.astype(np.uint32).ravel(), target=pygltflib.ELEMENT_ARRAY_BUFFER)
     specular = texture("specularTexture")
+    extensions: dict[str, Any] = {"KHR_materials_specular": {
+        "specularTexture": {"index": specular.index}, "specularColorFactor": [material.specular_color] * 3,
+    }}  # fmt: skip
+    if material.coat is not None:
+        coat = {"index": texture("clearcoatTexture").index}
+        extensions["KHR_materials_clearcoat"] = {
+            "clearcoatFactor": 1.0, "clearcoatTexture": coat,
+            "clearcoatRoughnessFactor": 1.0, "clearcoatRoughnessTexture": coat,
+        }  # fmt: skip
     fitted = pygltflib.Material(
         name="fitted",
         pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
             baseColorTexture=texture("baseColorTexture"), metallicRoughnessTexture=texture("metallicRoughnessTexture")
         ),
         normalTexture=texture("normalTexture", pygltflib.NormalMaterialTexture),
-        extensions={"KHR_materials_specular": {
-            "specularTexture": {"index": specular.index}, "specularColorFactor": [material.specular_color] * 3,
-        }},
+        extensions=extensions,
         extras={"mi_ring": {"bsdf": bsdf, "scale": material.scale}},
     )  # fmt: skip
     node = pygltflib.Node(
@@ -200,7 +254,7 @@ def assemble_glb(
     )  # fmt: skip
     file = pygltflib.GLTF2(
         asset=pygltflib.Asset(version="2.0", generator="mi_ring"), scene=0, scenes=[pygltflib.Scene(nodes=[0])],
-        nodes=[node], materials=[fitted], extensionsUsed=["KHR_materials_specular"],
+        nodes=[node], materials=[fitted], extensionsUsed=[*extensions],
         meshes=[pygltflib.Mesh(primitives=[pygltflib.Primitive(attributes=attributes, indices=indices, material=0)])],
         textures=[pygltflib.Texture(sampler=0, source=k) for k in range(len(sources))], samplers=[sampler],
         images=sources, accessors=accessors, bufferViews=buffer_views,

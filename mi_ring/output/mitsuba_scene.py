@@ -7,8 +7,9 @@ from typing import TypeAlias
 import mitsuba as mi
 import numpy as np
 
+from mi_ring.capture.emitter_elements import emitter_element
 from mi_ring.capture.loading import open_scene
-from mi_ring.capture.scenefile import emitter_element, perspective_element
+from mi_ring.capture.scenefile import perspective_element
 from mi_ring.errors import InputError
 from mi_ring.images import write_image
 from mi_ring.output import gltf
@@ -60,11 +61,14 @@ def write_scene(
     files.append(path.with_name(f"{path.stem}_object.ply"))
     write_ply(mesh, files[-1])
 
-    def bitmap(parent: ElementTree.Element, name: str, image: np.ndarray) -> None:
-        """Write a texture with values (N, 3) or (N,) at the texels, and add its XML to `parent`."""
+    def bitmap(parent: ElementTree.Element, name: str, image: np.ndarray, parameter: str = "") -> None:
+        """Write a texture with values (N, 3) or (N,) at the texels, and add its XML to `parent`.
+
+        `name`: of the file, and of the BSDF's parameter unless `parameter` is given.
+        """
         files.append(path.with_name(f"{path.stem}_{name}.exr"))
         write_image(image[texels.index].astype(np.float32).reshape(*texels.index.shape, -1), files[-1])
-        texture = ElementTree.SubElement(parent, "texture", name=name, type="bitmap")
+        texture = ElementTree.SubElement(parent, "texture", name=parameter or name, type="bitmap")
         ElementTree.SubElement(texture, "string", name="filename", value=files[-1].name)
         if image.ndim == 1:
             ElementTree.SubElement(texture, "boolean", name="raw", value="true")
@@ -75,16 +79,21 @@ def write_scene(
     ElementTree.SubElement(shape, "string", name="filename", value=files[1].name)
     element, scale = ElementTree.fromstring(bsdf), 1.0
     if element.get("type") == "cooktorrance":
-        material = gltf.metallic_roughness(bsdf, values)
-        scale = material.scale
+        matte, gloss, widths, scale = gltf.shares(bsdf, values)
+        weight = gloss.sum(1).clip(0, 1)
         distribution = next((e.get("value", "") for e in element if e.get("name") == "distribution"), "ggx")
         element = ElementTree.SubElement(shape, "bsdf", type="blendbsdf")
-        bitmap(element, "weight", material.specular)
-        bitmap(ElementTree.SubElement(element, "bsdf", type="diffuse"), "reflectance", material.base_color)
-        gloss = ElementTree.SubElement(element, "bsdf", type="roughconductor")
-        ElementTree.SubElement(gloss, "string", name="material", value="none")
-        ElementTree.SubElement(gloss, "string", name="distribution", value=distribution)
-        bitmap(gloss, "alpha", material.roughness**2)
+        bitmap(element, "weight", weight)
+        base = (matte / np.maximum(1 - weight, 1e-3)[:, None]).clip(0, 1)
+        bitmap(ElementTree.SubElement(element, "bsdf", type="diffuse"), "reflectance", base)
+        if gloss.shape[1] > 1:
+            element = ElementTree.SubElement(element, "bsdf", type="blendbsdf")
+            bitmap(element, "coat", gloss[:, 1] / np.maximum(gloss.sum(1), 1e-12), "weight")
+        for name, width in zip(("alpha", "coat_alpha"), widths.T):
+            conductor = ElementTree.SubElement(element, "bsdf", type="roughconductor")
+            ElementTree.SubElement(conductor, "string", name="material", value="none")
+            ElementTree.SubElement(conductor, "string", name="distribution", value=distribution)
+            bitmap(conductor, name, width, "alpha")
     else:
         shape.append(element)
         for texture in [t for t in element.iter("texture") if t.get("type") == "mesh_attribute"]:

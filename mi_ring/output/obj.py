@@ -26,12 +26,14 @@ def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material)
     }.items():  # fmt: skip
         files[name] = path.with_name(f"{path.stem}_{name}.png")
         write_image(image, files[name])
-    library = path.with_suffix(".mtl")
+    library, coat = path.with_suffix(".mtl"), []
+    if material.coat is not None and material.coat_roughness is not None:  # programs read no textures of them
+        coat = [f"Pc {material.coat.mean():.4g}", f"Pcr {material.coat_roughness.mean():.4g}"]
     write_file(library, "\n".join([
         "newmtl fitted", "illum 2", "Kd 1 1 1", f"map_Kd {files['diffuse'].name}",
         "Ks {0:.4g} {0:.4g} {0:.4g}".format(min(0.04 * material.specular_color, 1)), f"map_Ks {files['specular'].name}",
         "Pr 1", f"map_Pr {files['roughness'].name}", "Pm 1", f"map_Pm {files['metallic'].name}",
-        f"norm {files['normal'].name}", "",
+        f"norm {files['normal'].name}", *coat, "",
     ]))  # fmt: skip
     _, first, uncut = np.unique(atlas.uncut, return_index=True, return_inverse=True)
     corners = np.stack([uncut, np.arange(len(uncut)), uncut], 1)[atlas.faces] + 1

@@ -11,10 +11,10 @@ from PIL import Image, ImageDraw
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.reduction import whole_mask
 from mi_ring.capture.scenefile import (
-    at_level,
     fitted_scene_xml,
     recalibrated_xml,
     remasked_xml,
+    updated,
     with_missing_photographs,
 )
 from mi_ring.errors import InputError
@@ -172,7 +172,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
     write_state(compact(ring_state(ring, result.settings)), folder / "ring.pt")
     views = capture.views
     unseen = write_mesh(ring, ring.subdivisions, folder / "mesh.ply", views=views)
-    scene = at_level(scene, ring.subdivisions)  # details have changed it
+    scene = updated(scene, ring.subdivisions, ring.bsdf)  # details and a second lobe have changed them
     if result.summary:
         scene = recalibrated_xml(scene, capture.shots, result.room, result.room_frames, result.lamps, result.lobes)
     if result.masks:

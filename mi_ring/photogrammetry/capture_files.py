@@ -7,8 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mi_ring.capture.emitter_elements import Element
 from mi_ring.capture.grabcut import dilate_by_share
-from mi_ring.capture.scenefile import Element, photograph_element, table_element
+from mi_ring.capture.scenefile import photograph_element, table_element
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.importers.camera_models import Lens
 from mi_ring.importers.undistortion import Window, undistort

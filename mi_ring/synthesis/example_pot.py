@@ -8,7 +8,8 @@ import numpy as np
 import trimesh
 from scipy.interpolate import CubicSpline
 
-from mi_ring.capture.scenefile import Element, photograph_element, scene_bytes, scene_element
+from mi_ring.capture.emitter_elements import Element
+from mi_ring.capture.scenefile import photograph_element, scene_bytes, scene_element
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb, to_bytes, write_image
 from mi_ring.scene.lights import Light

@@ -19,7 +19,17 @@ from mi_ring.scene.xml_elements import load_element
 COLOURS = "vertex_color"  #: name of the mesh attribute with the colours of the mesh file
 COLOURED = f"principled base_color={COLOURS} roughness=0.4"  #: default material of a mesh with colours
 PLAIN = "principled base_color=0.55,0.4,0.25 roughness=0.4"  #: default material of other meshes
-FORMS = "a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, or a plugin with its parameters"
+#: Glossy materials by name. Their highlights are sharp and wide at once: no single lobe describes them.
+NAMED: dict[str, dict[str, Any]] = {
+    "brass": {"type": "blendbsdf", "weight": 0.5, **{
+        f"bsdf_{k}": {"type": "principled", "base_color": {"type": "rgb", "value": [0.89, 0.79, 0.43]}, "metallic": 1.0,
+                      "roughness": roughness} for k, roughness in enumerate((0.35, 0.65))
+    }},
+    "varnish": {"type": "principled", "base_color": {"type": "rgb", "value": [0.45, 0.22, 0.09]}, "roughness": 0.7,
+                "specular": 0.5, "clearcoat": 1.0, "clearcoat_gloss": 0.85},
+}  # fmt: skip
+FORMS = ("brass, varnish, a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, or a plugin with its "
+         "parameters")  # fmt: skip
 
 
 class Pattern(NamedTuple):
@@ -62,16 +72,18 @@ def pattern_of(kind: str, vertices: np.ndarray, bands: int, up: int, field: str)
 def load_material(text: str, field: str, coloured: bool) -> mi.BSDF:
     """Make the BSDF that an option describes.
 
-    `text`: path of an XML file with one <bsdf>, path of a .binary file of the MERL database, FILE.npz:MATERIAL, or a
-    Mitsuba plugin with parameters, such as `principled roughness=0.3`. `field`: name of the option, for messages.
-    `coloured`: the mesh has colours, to which a plugin may refer as vertex_color. Raises InputError if there is no such
-    BSDF.
+    `text`: a name in `NAMED`, path of an XML file with one <bsdf>, path of a .binary file of the MERL database,
+    FILE.npz:MATERIAL, or a Mitsuba plugin with parameters, such as `principled roughness=0.3`. `field`: name of the
+    option, for messages. `coloured`: the mesh has colours, to which a plugin may refer as vertex_color. Raises
+    InputError if there is no such BSDF.
     """
     file, _, name = text.partition(".npz:")
     path = Path(f"{file}.npz" if name else text)
     found: Any = None
     try:
-        if text.lower().endswith(".xml"):
+        if text in NAMED:
+            found = mi.load_dict(NAMED[text])
+        elif text.lower().endswith(".xml"):
             require_file(path, FORMS, field)
             with reading(f"{path}: {field}", "XML"):
                 root = ElementTree.fromstring(path.read_bytes())

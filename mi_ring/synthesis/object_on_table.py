@@ -9,7 +9,8 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mi_ring.capture.scenefile import Element, emitter_element, table_element
+from mi_ring.capture.emitter_elements import Element, emitter_element
+from mi_ring.capture.scenefile import table_element
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import read_mesh

@@ -20,9 +20,10 @@ class SynthesizeConfig:
     The middle of the mesh's bounding box is moved to the origin, and its farthest vertex is scaled to --radius. The
     mesh is not rotated.
 
-    A material is one of these: an .xml file with one <bsdf>; a .binary file of the MERL database; FILE.npz:MATERIAL, a
-    network fitted to such a file; or a Mitsuba plugin with its parameters, as in "principled base_color=0.6,0.2,0.1
-    roughness=0.3". The value vertex_color stands for the colours in the file of the mesh.
+    A material is one of these: brass (polished) or varnish (over wood); an .xml file with one <bsdf>; a .binary file of
+    the MERL database; FILE.npz:MATERIAL, a network fitted to such a file; or a Mitsuba plugin with its parameters, as
+    in "principled base_color=0.6,0.2,0.1 roughness=0.3". The value vertex_color stands for the colours in the file of
+    the mesh.
 
     After an interruption, give the same command again: it continues.
     """

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mi_ring.capture import scenefile
-from mi_ring.capture.scenefile import Element, move_names
+from mi_ring.capture.emitter_elements import Element, emitter_element, numbers, room_elements
+from mi_ring.capture.scenefile import move_names
 from mi_ring.errors import InputError
 from mi_ring.foreign import reading
 from mi_ring.geometry.camera import Camera
@@ -122,7 +123,7 @@ class Studio:
         file = Path(str(self.config.environment)).resolve()
         element = ElementTree.Element("emitter", type="envmap")
         ElementTree.SubElement(element, "string", name="filename", value=str(file))
-        ElementTree.SubElement(element, "float", name="scale", value=scenefile.numbers(scale))
+        ElementTree.SubElement(element, "float", name="scale", value=numbers(scale))
         upright = np.eye(4)
         upright[:3, :3] = Rotation.align_vectors([self.config.up_axis], [[0.0, 1.0, 0.0]])[0].as_matrix()
         scenefile.add_pose(element, upright)
@@ -248,11 +249,11 @@ def write_scenes(
     if studio.environment is not None:
         emitters = [studio.environment_element(exposure)]
     elif config.room:
-        emitters = scenefile.room_elements(exposure * studio.room_level * studio.room)
+        emitters = room_elements(exposure * studio.room_level * studio.room)
     for lamp in studio.further_lamps((seen + novel)[0].light):
-        emitters.append(scenefile.emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
+        emitters.append(emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
     # For pairs the room is unknown, but not that it stood still while the object turned.
-    turning = scenefile.room_elements(np.zeros((BASIS, 3)), {"camera"}) if config.cameras == "turntable" else []
+    turning = room_elements(np.zeros((BASIS, 3)), {"camera"}) if config.cameras == "turntable" else []
     up, ground = (config.up_axis, studio.ground) if config.table != "none" else (None, None)
     metres = 0.001 if config.table == "sheet" else None
 
