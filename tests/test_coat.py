@@ -20,9 +20,9 @@ from mi_ring import export
 from mi_ring.capture.loading import load_capture
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.fitting import schedule
+from mi_ring.fitting.coat_selection import ENOUGH
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
-from mi_ring.fitting.lobe_selection import ENOUGH
 from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.nets.brdf_net import COAT as COAT_PARAMETERS
 from mi_ring.nets.brdf_net import COOK_TORRANCE, BRDFNet
@@ -258,7 +258,7 @@ def fits(small_capture, tmp_path_factory):
 
 def test_a_fit_adds_a_second_lobe_where_photographs_show_one(fits):
     one, two = fits
-    assert one.course.lobes["gain"] < 0.5 * ENOUGH and two.course.lobes["gain"] > 1.3 * ENOUGH
+    assert one.course.coat["gain"] < 0.5 * ENOUGH and two.course.coat["gain"] > 1.3 * ENOUGH
     assert [p.name for p in one.ring.brdf_net.bsdf_parameters][-1] == "diffuse_roughness"
     assert [p.name for p in two.ring.brdf_net.bsdf_parameters][-2:] == ["coat", "coat_roughness"]
     with torch.no_grad():
@@ -273,14 +273,14 @@ def test_a_fit_that_looked_for_a_second_lobe_in_vain_is_the_same_as_without(fits
             plain.step()
     ours, theirs = (fit.ring.state_dict() for fit in (fits[0], plain))
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
-    assert fits[0].course.lobes and not plain.course.lobes
+    assert fits[0].course.coat and not plain.course.coat
 
 
 def test_a_fit_with_a_second_lobe_goes_on_from_its_state(fits):
     """The network of the state has more outputs than that of a new fit, and so have Adam's moments."""
     two = fits[1]
     again = Fit(two.problem.given, two.problem.config, state=two.state())
-    assert again.ring.bsdf == two.ring.bsdf and again.course.lobes == two.course.lobes
+    assert again.ring.bsdf == two.ring.bsdf and again.course.coat == two.course.coat
     width = len(again.ring.brdf_net.output.weight)
     moments = again.optimisation.optimizers[0].state[again.ring.brdf_net.output.weight]
     assert width == 8 and moments["exp_avg"].shape == moments["exp_avg_sq"].shape == (8, 256)

@@ -20,7 +20,7 @@ from mi_ring.capture.emitter_elements import room_elements
 from mi_ring.capture.scenefile import scene_bytes
 from mi_ring.fitting import schedule
 from mi_ring.fitting.lighting import Lighting
-from mi_ring.fitting.lobe_search import find_lobes
+from mi_ring.fitting.small_lights import find_lobes
 from mi_ring.images import write_image
 from mi_ring.plugins.matte_reflection import softened_cosine, zonal_coefficients
 from mi_ring.rendering import indirect_light, lobe_light, prediction

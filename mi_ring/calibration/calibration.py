@@ -212,16 +212,18 @@ class Calibration(nn.Module):
         return lobes if lobes is None or "ambient" in self.refined else lobes.scaled(1 / self.albedo_factor)
 
     @torch.no_grad()
-    def room_share(self, harmonics: Tensor) -> Tensor:
+    def room_share(self, harmonics: Tensor, lobes: Lobes | None = None) -> Tensor:
         """Compare the room's light with the photographs' own lights, of those that have one, at the object.
 
-        Returns a ratio (3,), one for each colour. `harmonics` (BASIS, 3): the room's light. The ratio is the mean
-        irradiance by the room, divided by the irradiance of a surface that faces the photograph's light. If photographs
-        have no lights of their own, the result is the mean radiance (3,) of the room.
+        Returns a ratio (3,), one for each colour. `harmonics` (BASIS, 3), `lobes`: the room's light. The ratio is the
+        mean irradiance by the room, divided by the irradiance of a surface that faces the photograph's light. If
+        photographs have no lights of their own, the result is the mean radiance (3,) of the room.
         """
         now = self()
         distance2 = torch.where(self.rig.finite, (now.places - self.rig.center).square().sum(-1, keepdim=True), 1.0)
         mean = math.pi * harmonics[0].cpu() / math.sqrt(4 * math.pi)
+        if lobes is not None:
+            mean = mean + math.pi * torch.from_numpy(lobes.mean_radiance()).to(mean)
         own = (now.strengths / distance2)[self.rig.mainly].median(0).values
         return mean / own if bool((own > 0).all()) else mean / math.pi
 

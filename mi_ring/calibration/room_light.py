@@ -121,7 +121,7 @@ class RoomLight(nn.Module):
         return [(getattr(self, now).detach(), getattr(self, given)) for now, given in [("harmonics", "given"), *names]]
 
     def forget(self) -> None:
-        """Set the normal equations to 0, so that earlier photographs no longer count. The harmonics do not change."""
+        """Set the normal equations to 0, so that earlier photographs no longer count. The light does not change."""
         self.matrix.zero_()
         self.vector.zero_()
         self.shown.zero_()

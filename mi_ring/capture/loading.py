@@ -48,7 +48,7 @@ def load_capture(
     These need a dark room. If the room was lit, there are no masks then.
 
     `pairs` is one of "subtract" and "both". It is for photographs with an image `ambient`, which is always subtracted.
-    "both" also makes this image another photograph, which the room alone lights, unless the scene gives no mask of it.
+    "both" also makes this image another photograph, which the room alone lights, unless it has no mask.
     """
     path = Path(path)
     if pairs not in ("subtract", "both"):

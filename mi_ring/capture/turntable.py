@@ -33,7 +33,7 @@ def on_rings(poses: np.ndarray) -> bool:
     if axis is None:
         return False
     left = np.arange(len(poses))
-    axes = turns.mT @ axis  # in the axes of each camera
+    axes = turns.swapaxes(1, 2) @ axis  # in the axes of each camera
     beside = 0
     while len(left):
         ring = left[axes[left] @ axes[left[0]] > np.cos(np.radians(ALIKE))]
@@ -43,11 +43,14 @@ def on_rings(poses: np.ndarray) -> bool:
 
 
 def axis_of(turns: np.ndarray) -> np.ndarray | None:
-    """Find the axis (3,) of most rotations between two cameras. `turns` (P, 3, 3): camera to world. None: of no two."""
+    """Find the axis (3,) that most rotations from one camera to another have. None: no two cameras are turned enough.
+
+    `turns` (P, 3, 3): camera to world.
+    """
     random = np.random.default_rng(0)
     first, second = np.triu_indices(len(turns), 1)
     chosen = random.permutation(len(first))[:PAIRS]
-    between = Rotation.from_matrix(turns[second[chosen]] @ turns[first[chosen]].mT).as_rotvec()
+    between = Rotation.from_matrix(turns[second[chosen]] @ turns[first[chosen]].swapaxes(1, 2)).as_rotvec()
     angles = np.linalg.norm(between, axis=1)
     large = (angles > np.radians(TURNED[0])) & (angles < np.radians(TURNED[1]))
     if not large.any():
@@ -59,8 +62,9 @@ def axis_of(turns: np.ndarray) -> np.ndarray | None:
 
 
 def is_ring(turns: np.ndarray, places: np.ndarray, axis: np.ndarray) -> bool:
-    """Test whether cameras are one camera that is turned about an axis (3,) somewhere. `turns` (n, 3, 3), `places` (n,
-    3): camera to world.
+    """Test whether n cameras are one camera that is turned about an axis.
+
+    `turns` (n, 3, 3), `places` (n, 3): camera to world. `axis` (3,): its direction.
     """
     # A point c of the axis is at the same place k in the axes of all cameras: c - R k = place.
     design = np.concatenate([np.concatenate([np.eye(3), -turn], 1) for turn in turns])

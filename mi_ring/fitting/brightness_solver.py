@@ -76,11 +76,15 @@ class BrightnessSolver(torch.optim.Optimizer):
         pixels = (it.object_pixels() & ~it.observation.clipped.any(-1)).cpu()
         observed, predicted = it.observation.rgb.cpu(), it.prediction.rgb.cpu()
         slopes = contrast_slope(predicted, rig.response, index, directions[..., 2:])
-        sideways = flash_slope(self.calibration, index, directions, it.prediction.normals().cpu())
+        sideways = torch.zeros(*pixels.shape, 2)
+        if {"falloff", "light"} <= {*self.calibration.unknowns}:
+            sideways = flash_slope(self.calibration, index, directions, it.prediction.normals())
         bright = torch.minimum(observed, predicted) > BLACK * it.context.exposure
         found = torch.zeros(len(index), COLUMNS + 1, COLUMNS + 1)
         for n, inside in enumerate(pixels):
-            for colour in range(3 if rig.lit[index[n]] or not rig.mixed else 0):
+            if rig.mixed and not rig.lit[index[n]]:
+                continue
+            for colour in range(3):
                 chosen = inside & bright[n, ..., colour]
                 if int(chosen.sum()) < ENOUGH:
                     continue

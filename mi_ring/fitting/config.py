@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args, get_origin
 
 from mi_ring.errors import InputError
 from mi_ring.fitting.setting_types import as_typed, of_type
+from mi_ring.scene.lobes import MOST_LOBES
 from mi_ring.version import __version__
 
 #: Weights of the default terms of the loss. `Config.weights` has these where nothing else is given.
@@ -116,7 +117,7 @@ class Tuning:
     mesh skips two thirds of the iterations of the first stage. It adds 40 % of the skipped iterations to the second."""
     small_lights: int = 0
     """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
-    Only if the room is the only light. 0: the light is smooth. Give 8 if it was small and the object is glossy."""
+    Only if the room is the only light. 0: none are sought. Give 8 if the light was small and the object is glossy."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
     A fit with --detail chooses the level itself, 7 or 8 for most captures.
@@ -174,8 +175,8 @@ class Ablation:
     Give --no-indirect if the light intensities in the scene file are wrong."""
     pairs: Literal["subtract", "both"] = "subtract"
     """What the fit does with photographs that name an image `ambient`: the same view without the photograph's light.
-    subtract: it only subtracts this image. both: it also fits it, as a photograph in the light of the room, which it
-    finds. It then sees each photograph half as often: give more --iterations."""
+    subtract: it only subtracts this image. both: it also fits it, as a photograph that the room alone lights, and finds
+    this light. It then sees each photograph half as often: give more --iterations."""
     loss: Literal["l2", "l1", "log", "l1+log"] = "l1+log"
     """How the difference of predicted and observed colours is measured.
     l2: squared difference, as in the paper. l1: absolute difference, less sensitive to outliers.
@@ -184,7 +185,7 @@ class Ablation:
     """How matte surfaces reflect light. lambert: equally in all directions, as in the paper.
     rough: more toward the light, as wood, cloth and stone do. The fit finds how much, everywhere on the surface."""
     lobes: Literal["auto", "1", "2"] = "auto"
-    """Number of lobes of the highlights. 1: one at each point, as in the paper.
+    """Number of lobes of the highlights, unless the BSDF of the scene says. 1: one at each point, as in the paper.
     2: a second lobe, the coat. Varnish, glaze and polished metal have a sharp highlight in a wide one.
     auto: 1, and 2 from the middle of the fit on if the photographs show a second lobe."""
     optimizer: Literal["muon", "adam"] = "muon"
@@ -244,7 +245,7 @@ class Config(Ablation, Tuning, Common):
         for name in ("learning_rate", "muon_rate", "decay", "velocity_decay", "detail_rate"):
             require(0 < getattr(self, name) < math.inf, name, "above 0")
         require(0 <= self.detail_share < math.inf, "detail_share", "0 or more")
-        require(0 <= self.small_lights <= 32, "small_lights", "0 to 32")
+        require(0 <= self.small_lights <= MOST_LOBES, "small_lights", f"0 to {MOST_LOBES}")
         require(self.holdout == 0 or self.holdout >= 2, "holdout", "0, or 2 or more")
         require(0 <= self.subdivisions <= 8, "subdivisions", "0 to 8")
         require(bool(self.levels) and all(0 <= level <= 8 for level in self.levels), "levels", "one or more of 0 to 8")

@@ -19,7 +19,7 @@ class Course:
     seconds: float = 0.0  #: time of these iterations, and of coarse fits before them
     log: list[dict[str, Any]] = field(default_factory=list)  #: entries of every fifth iteration and of the last
     masks: Masks = field(default_factory=dict)  #: masks that were found anew
-    lobes: dict[str, float] = field(default_factory=dict)  #: what photographs say about a second lobe of highlights
+    coat: dict[str, float] = field(default_factory=dict)  #: what photographs say about a second lobe of highlights
     validation: dict[str, Any] = field(default_factory=dict)  #: on held-out photographs, when the fit is done
 
     @classmethod
@@ -48,5 +48,5 @@ class Course:
             "weights": it.weights, "learning_rate": learning_rate,
             "stage": it.context.schedule.stages.index(it.stage) + 1, "vertices": len(it.batch.points),
             "crossing": regulariser.crossing, "unexplained": regulariser.unexplained,
-            **({"second_lobe": self.lobes["gain"]} if self.lobes else {}),
+            **({"second_lobe": self.coat["gain"]} if self.coat else {}),
         })  # fmt: skip

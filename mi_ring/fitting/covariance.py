@@ -54,7 +54,7 @@ class Layout:
             if isinstance(unknown, Exposure):
                 for colour in range(3):
                     at = self.first[name] + 3 * self.calibration.rig.exposed[name].numpy() + colour
-                    result[np.ix_(at, at)] -= 1 / len(at)
+                    result[np.ix_(at, at)] -= 1 / max(len(at), 1)
         return result
 
     def of(self, index: np.ndarray) -> list[tuple[str, int, np.ndarray]]:
@@ -183,13 +183,13 @@ class CovarianceGroup:
     def photographs(self) -> Photographs:
         """Return the cameras and lights of the group for the renderer, with the current calibration.
 
-        Nothing is rendered. They contain the room's light only if the photographs have no lights of their own. Lamps in
-        the scene get their current values.
+        Nothing is rendered. They contain the harmonics of the room's light only if the photographs have no lights of
+        their own, its lobes always. Lamps in the scene get their current values.
         """
         calibration, photographs = self.calibration, self.problem.capture.selected(self.index, self.scale)
         calibration.relight(self.surface)
         room = calibration.room_harmonics().cpu().double().numpy() if self.dark else None
-        lobes = LobeLight.of(calibration.room_lobes()) if self.dark else None
+        lobes = LobeLight.of(calibration.room_lobes())
         lit = replace(photographs, room=room, lobes=lobes)
         return prediction.with_views(lit, calibration(self.scale).to(self.problem.device))
 
@@ -200,7 +200,7 @@ class CovarianceGroup:
         """
         shadows = self.problem.config.shadows and self.problem.capture.shadows
         photographs = self.photographs()
-        photographs = photographs if photographs.dark else replace(photographs, lobes=None)
+        photographs = photographs if self.dark else replace(photographs, lobes=None)
         return prediction.draw(self.surface, photographs, SPP, shadows=shadows, occlusion=False)
 
     def other(self, lit: Tensor, coverage: Tensor) -> tuple[Tensor, Tensor, Tensor]:

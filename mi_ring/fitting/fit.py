@@ -13,11 +13,11 @@ from torch import Tensor
 
 from mi_ring.capture.capture import Capture, Observation
 from mi_ring.errors import InputError
+from mi_ring.fitting.coat_selection import select_coat
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.course import Course
 from mi_ring.fitting.iteration import Context, Iteration
 from mi_ring.fitting.lighting import AMBIGUOUS, Lighting
-from mi_ring.fitting.lobe_selection import select_lobes
 from mi_ring.fitting.mask_refinement import find_masks, with_masks
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.optimisation import Optimisation
@@ -104,8 +104,8 @@ class Fit(Renamed):
         if "masks" in self.problem.config.refine and self.schedule.masks_due(self.iteration):
             self.refine_masks()
         self.optimisation.find_small_lights(self.renderer, self.schedule, self.iteration)
-        if self.problem.config.lobes == "auto" and self.schedule.lobes_due(self.iteration):
-            self.course.lobes |= select_lobes(self.problem, self.model, self.renderer, self.optimisation, self.capture)
+        if self.problem.config.lobes == "auto" and self.schedule.coat_due(self.iteration):
+            self.course.coat |= select_coat(self.problem, self.model, self.renderer, self.optimisation, self.capture)
         batch = self.sampler.draw(self.problem, self.schedule, self.ring.domain, self.iteration)
         observation = self.sampler.observe(self.problem, self.capture, batch)
         it = self.optimisation.step(lambda: self.evaluate(batch, observation))

@@ -66,10 +66,10 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     else:
         turned = object_turned(capture)
         if turned:
-            print("Light: the background is the same from several sides of the object, so the object turned")
+            print("Light: cameras are on rings and see the same background, so the object turned")
             turned = math.isfinite(trials.error(Lighting("turntable"))) or None
         elif turned is False:
-            print("Light: cameras or background moved around the object, so it did not turn")
+            print("Light: cameras or background moved, so the object did not turn")
         found = trials.likeliest(turned)
         if found.kind in ("environment", "lamps"):  # several lamps are between one and an environment
             found = trials.best(found, trials.lamps())

@@ -96,7 +96,7 @@ def require_compatible(capture: Capture, config: Config) -> None:
                          "the lamps of the scene out, or leave --light out")  # fmt: skip
     if any(shot.files.ambient for shot in capture.shots):
         raise InputError(f"{capture.path}: ambient: is subtracted, which leaves the photographs' own lights alone; "
-                         f"leave out --light {config.light}: the fit finds the light in `ambient` itself")  # fmt: skip
+                         f"leave out --light {config.light}; --pairs both finds the room's light")  # fmt: skip
     if capture.photographs.mixed:
         raise InputError(f"{capture.path}: emitter: some photographs have a light of their own, others none, but "
                          f"--light {config.light} finds one light for all; leave it out: the fit finds that of the "

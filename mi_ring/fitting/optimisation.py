@@ -15,15 +15,15 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import unfold
 from mi_ring.fitting.exposure_solver import ExposureSolver
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.lobe_search import find_lobes, finds_lobes
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.nan_guard import NanGuard
 from mi_ring.fitting.pose_solver import PoseSolver
 from mi_ring.fitting.problem import Problem
-from mi_ring.fitting.refinement import START
+from mi_ring.fitting.refinement import START, finds_small_lights
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
+from mi_ring.fitting.small_lights import find_lobes
 from mi_ring.fitting.terms import Term
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.machine import has_fast_bfloat16
@@ -64,7 +64,7 @@ def calibration_steppers(calibration: Calibration, config: Config) -> list[Stepp
 
 def lobe_steppers(calibration: Calibration, config: Config) -> list[Stepper]:
     """Make the optimiser of directions and sharpness of the room's lobes. Returns [] if the fit does not find lobes."""
-    if not finds_lobes(calibration, config):
+    if not finds_small_lights(calibration, config):
         return []
     room, rates = calibration.room, (LOBE_TURN, LOBE_SHARPEN)
     adam = torch.optim.Adam([{"params": [room.toward]}, {"params": [room.log_sharpness]}])
@@ -191,9 +191,9 @@ class Optimisation:
     def find_small_lights(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
         """Find the lobes of the room's light anew, if it is time. `iteration`: the next one, from 0."""
         calibration, problem = self.model.calibration, self.problem
-        if calibration is None or self.model.detailed or not finds_lobes(calibration, problem.config):
+        if calibration is None or not finds_small_lights(calibration, problem.config):
             return
-        if iteration in schedule.lights_sought:
+        if schedule.lights_due(iteration):
             level = schedule.stage(iteration).level
             found = problem.processes.on_first(lambda: find_lobes(problem, self.model, renderer, level, iteration))
             found.put_into(calibration.room)
@@ -223,8 +223,7 @@ class Optimisation:
         Returns the loss of all processes together.
         """
         processes = self.problem.processes
-        for optimizer in self.optimizers:
-            optimizer.zero_grad()
+        self.model.zero_grad()
         if processes.count > 1:
             loss = loss + 0 * it.prediction.vertices.sum()  # so that each process takes part in the backward pass
         if loss.requires_grad:

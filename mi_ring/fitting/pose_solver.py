@@ -88,14 +88,13 @@ class PoseSolver(torch.optim.Optimizer):
         super().__init__([{"params": [calibration.turn, calibration.move]}], {"lr": INITIAL})
         self.rate = Rate(INITIAL, DECAY, NEAR if near else FAR)
         self.seen: tuple[Tensor, Tensor] | None = None  #: cameras and their curvature
+        self.camera = calibration.rig.camera  #: (P,) number of each photograph's camera
 
     def look(self, it: Iteration) -> None:
         """Store the numbers of an iteration's cameras and the Gauss-Newton Hessians of its loss, for `step`."""
         self.seen = None
         if it.progress >= self.rate.start:
-            calibration = it.context.model.calibration
-            assert calibration is not None
-            cameras = calibration.rig.camera[torch.from_numpy(it.batch.all_photographs)]
+            cameras = self.camera[torch.from_numpy(it.batch.all_photographs)]
             self.seen = summed(cameras, it.batch.share.gathered(curvature(it)))
 
     @torch.no_grad()

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mi_ring.calibration.calibration import OPTIONS
+from mi_ring.calibration.calibration import OPTIONS, Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.capture.decoding import has_open_curve
@@ -50,8 +50,8 @@ class Refinement(NamedTuple):
         asked, count = TOLD_BY_MANY & {*config.refine}, len(problem.seen.photographs.mainly)
         several = count >= FEWEST
         if asked and not several:
-            raise InputError(f"{capture.path}: --refine {min(asked)}: the fit has {count} photographs, "
-                             f"which do not tell it; leave it out, or give at least {FEWEST}")  # fmt: skip
+            raise InputError(f"{capture.path}: --refine {min(asked)}: the fit has {count} photographs with a light of "
+                             f"their own, which do not tell it; leave it out, or give at least {FEWEST}")  # fmt: skip
         open_unknowns: set[str] = set()
         if several and "auto" in config.refine and not capture.known:
             open_unknowns |= {"falloff"} if Rig(capture, center, problem.exposure).open_cone else set()
@@ -86,7 +86,13 @@ def refined_of(
         if config.indirect and albedo >= 1 and not has_table(capture.scene):
             names.add("scale")
         names |= {"gain"} if varies_in_exposure(capture) else set()
-    lit = shared_emitters(capture.scene) or (capture.room is not None and capture.room.any())
-    if capture.photographs.mixed and not lit:
+    given = capture.lobes is not None or (capture.room is not None and capture.room.any())
+    if capture.photographs.mixed and not (given or shared_emitters(capture.scene)):
         names.add("ambient")  # nothing else lights some of the photographs
     return tuple(name for name in OPTIONS if name in names and (name != "lamps" or lamps_of(capture.scene)))
+
+
+def finds_small_lights(calibration: Calibration, config: Config) -> bool:
+    """Test whether a fit finds lobes: if the settings allow it, and the only light is an unknown room."""
+    alone = calibration.room.alone and not calibration.rig.lit.any()
+    return config.small_lights > 0 and alone and "ambient" in calibration.refined

@@ -12,6 +12,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.fitting.indirect_average import Averages, averaged
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.refinement import finds_small_lights
 from mi_ring.fitting.sampler import Batch
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering import prediction
@@ -96,7 +97,7 @@ class Renderer:
             self.surface, photographs, vertices, material, spp=config.spp, seed=batch.seeds["renderer"],
             shadows=config.shadows and problem.capture.shadows, views=refined,
             lamps=calibration.lamp_tensors() if calibration else [],
-            lobes=calibration.room.lobe_tensors() if calibration and "ambient" in calibration.refined else [],
+            lobes=calibration.room.lobe_tensors() if calibration and finds_small_lights(calibration, config) else [],
         )  # fmt: skip
         other, averages = self.other_light(model, batch, photographs, coverage)
         if other and model.ring.indirect:

@@ -14,9 +14,9 @@ FEWEST = 10  #: iterations for details: fewer do not show whether photographs ag
 SETTLING = 0.15  #: iterations of the settling stage, as a share of all iterations before it
 RAMP = 0.05  #: progress in which a learning rate rises from 0 to full, after its start
 MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
-#: Progress at which lobes of unknown room light are found: when harmonics have their full order, and again later.
+#: Progress at which small lights of an unknown room are sought: when harmonics have their full order, and later.
 LIGHTS_SOUGHT = 0.36, 0.5, 0.65, 0.8
-LOBES_COUNTED = 0.5  #: progress at which a fit decides about a second lobe of highlights
+COAT_DECIDED = 0.5  #: progress at which a fit decides about a second lobe of highlights
 EARLIEST = 20  #: iterations before that; shorter fits know too little of surface and material
 INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
@@ -103,14 +103,13 @@ class Schedule:
         """Test whether masks are refined before `iteration`, counted from 0, if the fit refines masks."""
         return iteration in [int(progress * self.shaping) for progress in MASKS_REFINED]
 
-    @property
-    def lights_sought(self) -> list[int]:
-        """Iterations, from 0, before which lobes of the room's light are found, if the fit finds any."""
-        return [int(progress * self.shaping) for progress in LIGHTS_SOUGHT]
+    def lights_due(self, iteration: int) -> bool:
+        """Test whether small lights are sought before `iteration`, counted from 0, if the fit seeks any."""
+        return iteration in [int(progress * self.shaping) for progress in LIGHTS_SOUGHT]
 
-    def lobes_due(self, iteration: int) -> bool:
-        """Test whether lobes are counted before `iteration`, counted from 0, if the fit chooses their number."""
-        return iteration == int(LOBES_COUNTED * self.shaping) >= EARLIEST
+    def coat_due(self, iteration: int) -> bool:
+        """Test whether the fit decides before `iteration`, counted from 0, whether the material has a coat."""
+        return iteration == int(COAT_DECIDED * self.shaping) >= EARLIEST
 
     def stage(self, iteration: int) -> Stage:
         """Return the stage of `iteration`, counted from 0."""

@@ -18,9 +18,9 @@ from tqdm import tqdm
 from mi_ring.errors import InputError
 from mi_ring.fitting.budget import Costs, measure
 from mi_ring.fitting.checkpoint import BEFORE, digests, write_checkpoint
+from mi_ring.fitting.coat_selection import described
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.lobe_selection import described
 from mi_ring.fitting.processes import ProcessLost
 from mi_ring.geometry.domain import Sphere
 from mi_ring.geometry.meshes import genus
@@ -172,10 +172,10 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
     stop = 0
     with bar:
         while fit.iteration < fit.iterations and not (stop := interrupted()):
-            retreats, lobes = fit.optimisation.guard.retreats, {**fit.course.lobes}
+            retreats, lobes = fit.optimisation.guard.retreats, {**fit.course.coat}
             it = fit.step()
-            if fit.course.lobes != lobes:
-                bar.write(described(fit.course.lobes))
+            if fit.course.coat != lobes:
+                bar.write(described(fit.course.coat))
             if fit.optimisation.guard.retreats > retreats:
                 bar.write(f"Iteration {it.number}: loss, gradient or weights were not finite; going on from the last "
                           "ones that were, by smaller steps")  # fmt: skip

@@ -42,7 +42,9 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
             what = "mean radiance of the environment: red, green, blue"
         mean = torch.zeros_like(room.harmonics)
         mean[0] = torch.hypot(torch.from_numpy(deviations["ambient"]).to(mean), room.doubted())
-        before, after, spread = (calibration.room_share(light).tolist() for light in (room.given, room.harmonics, mean))
+        given = None if capture.lobes is None else capture.lobes.scaled(rig.power)
+        lights = (room.given, given), (room.harmonics, room.lobes()), (mean, None)
+        before, after, spread = (calibration.room_share(*light).tolist() for light in lights)
         unknowns["ambient"] = {"what": what, "before": before, "after": after, "std": spread,
                                "harmonics": room.harmonics.tolist(),
                                "lobes": [] if refined.lobes is None else refined.lobes.values().tolist()}  # fmt: skip
@@ -58,9 +60,10 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
         own: dict[str, Any] = {"moved_px": float(np.linalg.norm(after - before, axis=1).mean())}
         std: dict[str, Any] = {}
         for name, unknown in single.items():
-            row = rig.camera[k] if unknown.per == "camera" else k
-            entry = unknown.describe_photograph(values[name][row], deviations[name][row], rig)
-            if entry and unknown.concerns(rig, bool(rig.lit[k])):
+            if not unknown.concerns(rig, bool(rig.lit[k])):
+                continue
+            row = unknown.rows(rig, np.array([k]))[0][0]
+            if entry := unknown.describe_photograph(values[name][row], deviations[name][row], rig):
                 key, own[key], std[key] = entry
         photographs[capture.names[k]] = own | {"std": std}
     return {"refined": list(calibration.refined), "light": str(problem.lighting), "unknowns": unknowns,

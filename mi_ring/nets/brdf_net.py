@@ -127,8 +127,7 @@ class BRDFNet(MLP, MaterialNet):
     def add_parameters(self, parameters: Sequence[Parameter]) -> list[tuple[nn.Parameter, nn.Parameter]]:
         """Predict further BSDF parameters, in place. Their outputs are 0 at first: `start` says what they are.
 
-        Returns pairs (old tensor, larger tensor) for optimisers: weight and bias of the last layer are new tensors.
-        The tensors of the last layer become larger. `mi_ring.fitting.muon` does not train them.
+        The last layer gets larger tensors. Returns pairs (old tensor, new tensor), for optimisers.
         """
         self.set_parameters([*self.bsdf_parameters, *parameters], float(self.scale))
         before, pairs = self.output, []

@@ -51,9 +51,11 @@ def small_lights(capture: Capture) -> list[tuple[str, str, str, str]]:
     shares = lobes.flux.mean(1) / max(lobes.flux.mean(1).sum() + smooth, 1e-12)
     rows = []
     for place, k in enumerate(np.argsort(-shares)[:BRIGHTEST]):
-        axes, wide = "camera" if lobes.in_camera[k] else "world", np.degrees(lobes.sharpness[k] ** -0.5)
+        axes = "camera" if lobes.in_camera[k] else "world"
+        half = np.degrees((2 * np.log(2) / lobes.sharpness[k]) ** 0.5)
         what = f"{'brightest light' if place == 0 else 'another light'}: direction in the axes of the {axes}"
-        rows.append((what, "", f"{numbers(lobes.toward[k], 3)}; {wide:.2g}° wide; {shares[k]:.0%} of the light", ""))
+        found = f"{numbers(lobes.toward[k], 3)}; half as bright {half:.2g}° away; {shares[k]:.0%} of the light"
+        rows.append((what, "", found, ""))
     return rows
 
 

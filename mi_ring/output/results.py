@@ -179,7 +179,7 @@ def write(folder: Path, result: FitResult, scene: bytes) -> None:
         scene = remasked_xml(scene, capture.shots, write_masks(folder / "masks", capture, result.masks))
     write_file(folder / "scene.xml", scene)
     if not capture.photographs.lit.all() and capture.room is not None and not shared_emitters(capture.scene):
-        # The room is the only light of photographs.
+        # The room is the only light of some photographs.
         radiance = room_envmap(capture.room, np.eye(4), lobes=capture.lobes).clip(min=0)
         write_image(radiance.astype(np.float32), folder / "environment.exr")
     print("Writing the report", flush=True)

@@ -11,7 +11,7 @@ from mi_ring.plugins.photograph import SHUTTER, Photograph
 from mi_ring.plugins.properties import number_list
 from mi_ring.rendering.lobe_light import sample_lobe
 from mi_ring.rendering.photograph_lights import DISTANT
-from mi_ring.rendering.spherical_harmonics import MAX_ORDER
+from mi_ring.rendering.spherical_harmonics import MAX_ORDER, to_world_axes
 from mi_ring.scene.lobes import LARGEST_SHARPNESS, LEAST_SHARPNESS, MOST_LOBES, solid_angle
 
 
@@ -19,7 +19,7 @@ class Room(InvisibleEmitter):
     """Light from infinitely far away: spherical harmonics up to order 4 of the direction, and lobes.
 
     A lobe is a small light, such as a window, a lamp or the sun. Its radiance in the direction w is
-    c exp(κ (w·d − 1)), with a direction d, a sharpness κ and a colour c. κ = 3283 / a² makes it fall to one half at a°
+    c exp(κ (w·d − 1)), with a direction d, a sharpness κ and a colour c. κ = 4551 / a² makes it fall to one half at a°
     from d, for a below about 40°.
 
     The light is fixed in the world, or it is fixed to the camera. The second is the light of the room if the object
@@ -67,12 +67,15 @@ class Room(InvisibleEmitter):
         self.harmonics = mi.Float(number_list(props, "harmonics", counts))
         lobes = number_list(props, "lobes", range(0, 7 * MOST_LOBES + 1, 7)) if "lobes" in props else []
         for k, (*toward, sharpness, red, green, blue) in enumerate(np.reshape(lobes, (-1, 7)).tolist()):
-            if not (any(toward) and LEAST_SHARPNESS <= sharpness <= LARGEST_SHARPNESS and min(red, green, blue) >= 0):
-                raise ValueError(
-                    f'room "{props.id()}": lobes: of lobe {k} the direction is {toward}, must not be 0; its sharpness '
-                    f"{sharpness:g}, must be {LEAST_SHARPNESS:g} to {LARGEST_SHARPNESS:g}; the colour is "
-                    f"{[red, green, blue]}, must not be negative"
-                )
+            wrong = None
+            if not any(toward):
+                wrong = f"direction is {toward}, must not be 0"
+            elif not LEAST_SHARPNESS <= sharpness <= LARGEST_SHARPNESS:
+                wrong = f"sharpness is {sharpness:g}, must be {LEAST_SHARPNESS:g} to {LARGEST_SHARPNESS:g}"
+            elif not min(red, green, blue) >= 0:
+                wrong = f"colour is {[red, green, blue]}, must not be negative"
+            if wrong:
+                raise ValueError(f'room "{props.id()}": lobes: of lobe {k} the {wrong}')
         self.lobes = mi.Float(lobes)
 
     @property
@@ -132,8 +135,7 @@ class Room(InvisibleEmitter):
             if Photograph.current is None:
                 return ds, mi.Spectrum(0)
             active &= it.time == SHUTTER
-            m = Photograph.current.to_world.matrix
-            ds.d = mi.Vector3f(*(dr.dot(mi.Vector3f(m[i, 0], m[i, 1], m[i, 2]), direction) for i in range(3)))
+            ds.d = to_world_axes(direction, Photograph.current.to_world.matrix)
         ds.p = it.p + DISTANT * ds.d
         return ds, dr.select(active, mi.Spectrum(self.radiance(direction) / density), 0)
 

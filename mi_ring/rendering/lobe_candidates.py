@@ -7,7 +7,7 @@ import numpy as np
 from mi_ring.rendering.direct_light import next_2d
 from mi_ring.rendering.lobe_light import reflected_lobe
 from mi_ring.rendering.photographs import LANES, Photographs, center_rays
-from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes
+from mi_ring.rendering.spherical_harmonics import bsdfs_with_lobes, to_world_axes
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.alignment import to_flat
 
@@ -37,9 +37,8 @@ def candidate_pictures(
             si = seen.compute_surface_interaction(dr.gather(mi.Ray3f, ray, pixel))
             direction = dr.gather(mi.Vector3f, directions, one)
             if in_camera:
-                m = photographs.camera(dr.gather(mi.UInt32, view, pixel)).to_world
-                rows = (mi.Vector3f(m[k, 0], m[k, 1], m[k, 2]) for k in range(3))
-                direction = mi.Vector3f(*(dr.dot(row, direction) for row in rows))
+                camera = photographs.camera(dr.gather(mi.UInt32, view, pixel))
+                direction = to_world_axes(direction, camera.to_world)
             random = next_2d(seed, dr.width(lane), lane + dr.opaque(mi.UInt32, first * count % 2**32))
             value = reflected_lobe(
                 surface.scene, bsdfs, si, direction, dr.gather(mi.Float, sharp, one), random, si.is_valid()

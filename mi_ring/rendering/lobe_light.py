@@ -9,6 +9,7 @@ import numpy as np
 
 from mi_ring.rendering.direct_light import light_visible
 from mi_ring.rendering.photograph_lights import DISTANT
+from mi_ring.rendering.spherical_harmonics import to_world_axes
 from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.lobes import Lobes
 
@@ -39,7 +40,7 @@ class LobeLight:
         """Return (direction in the world, sharpness) of lobe `j`. `to_world`: pose of the camera of each lane."""
         d = dr.gather(mi.Vector3f, self.toward, j)
         if self.in_camera[j]:
-            d = mi.Vector3f(*(to_world[i, 0] * d.x + to_world[i, 1] * d.y + to_world[i, 2] * d.z for i in range(3)))
+            d = to_world_axes(d, to_world)
         return d, dr.gather(mi.Float, self.sharpness, j)
 
     def reflected(self, scene, bsdfs: Collection, si, to_world, random, active=True) -> list:
@@ -61,8 +62,8 @@ class LobeLight:
         pick, count = random(), len(self)
         j = dr.minimum(mi.UInt32(pick.x * count), count - 1)
         direction = dr.gather(mi.Vector3f, dr.detach(self.toward), j)
-        seen = mi.Vector3f(*(dr.dot(mi.Vector3f(*(to_world[i, k] for k in range(3))), direction) for i in range(3)))
-        direction = dr.select(dr.gather(mi.Bool, mi.Bool(list(self.in_camera)), j), seen, direction)
+        in_camera = dr.gather(mi.Bool, mi.Bool(list(self.in_camera)), j)
+        direction = dr.select(in_camera, to_world_axes(direction, to_world), direction)
         ds = at_distance(si, sample_lobe(direction, dr.gather(mi.Float, dr.detach(self.sharpness), j), random()))
         value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ds.d), active)
         lit = active & dr.any(value != 0)

@@ -119,6 +119,14 @@ def to_camera_axes(direction, to_world):
     return mi.Vector3f(*(dr.dot(mi.Vector3f(*(to_world[j, i] for j in range(3))), direction) for i in range(3)))
 
 
+def to_world_axes(direction, to_world):
+    """Convert directions (mi.Vector3f) from camera to world coordinates. Returns a mi.Vector3f.
+
+    `to_world`: camera-to-world transform of each direction, a mi.Transform4f or its matrix.
+    """
+    return mi.Vector3f(*(dr.dot(mi.Vector3f(*(to_world[i, j] for j in range(3))), direction) for i in range(3)))
+
+
 def bsdfs_with_lobes(scene) -> list:
     """List the BSDFs of a scene that can reflect spherical harmonics in closed form (they have a method `lobes`).
 

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.room_light import DIM, RIDGE, SHARPNESS, RoomLight
-from mi_ring.fitting.config import Config
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
@@ -36,7 +35,6 @@ RINGS = (6.0, 3.0, 1.5)  #: steps by which a direction is refined [degrees]
 #: second share.
 ADDED, KEPT = 0.05, 0.01
 APART = 0.5  #: distance of lobes, relative to the sum of their widths, below which two are one
-AGE = 20.0  #: iterations that the photographs of a search count for in the normal equations
 
 
 @dataclass(frozen=True)
@@ -50,17 +48,11 @@ class FoundLobes:
 
     @torch.no_grad()
     def put_into(self, room: RoomLight) -> None:
-        """Set the light of `room`. Its normal equations become those of the search, which count as `AGE` iterations."""
+        """Set the light of `room`. Its normal equations become those of the search, of equal weight."""
         room.place(self.lobes)
         room.harmonics.copy_(self.harmonics)
         room.matrix.copy_(self.matrix)
         room.vector.copy_(self.vector)
-
-
-def finds_lobes(calibration: Calibration, config: Config) -> bool:
-    """Test whether a fit finds lobes: if the settings allow it, and the only light is an unknown room."""
-    alone = calibration.room.alone and not calibration.rig.lit.any()
-    return config.small_lights > 0 and alone and "ambient" in calibration.refined
 
 
 def find_lobes(problem: Problem, model: Model, renderer: Renderer, level: int, iteration: int) -> FoundLobes:
@@ -115,6 +107,8 @@ class LobeSearch:
             inside = (seen.surely(around.alpha.cpu()) & ~seen.clipped.any(-1)).ravel().nonzero()[:, 0].numpy()
             most = PIXELS * len(index) // len(fitted)
             pixels = np.sort(random.permutation(inside)[:most]).astype(np.uint32)
+            if not len(pixels):
+                continue
             self.parts.append((photographs, pixels))
             chosen = torch.from_numpy(pixels.astype(np.int64))
             basis.append(around.transfer.flatten(1, 3).cpu()[:, chosen].movedim(0, 1))
@@ -150,7 +144,7 @@ class LobeSearch:
             rest = target - own @ (own.T @ target)
             new = new - own @ (own.T @ new)
             along = (new.T @ rest).clamp(min=0)
-            least = 1e-6 * float(candidates[..., colour].square().sum(0).max())
+            least = max(1e-6 * float(candidates[..., colour].square().sum(0).max()), 1e-30)
             gains += along**2 / new.square().sum(0).clamp(min=least)
             left += float(rest.square().sum())
         return gains, left
@@ -167,7 +161,7 @@ class LobeSearch:
         gains, left = self.gains(self.candidates(toward, np.full(GRID, FIRST_SHARPNESS)))
         best = int(gains.argmax())
         lobe, gain, _ = self.refined(toward[best], FIRST_SHARPNESS)
-        if gain < ADDED * left or any(are_one(lobe, other) for other in self.lobes):
+        if not gain >= ADDED * left or any(are_one(lobe, other) for other in self.lobes):
             return False
         self.lobes.append(lobe)
         self.pictures.append(self.picture(*lobe))
@@ -206,7 +200,7 @@ class LobeSearch:
         while k < len(self.lobes):
             gains, left = self.gains(self.pictures[k][:, None], without=k)
             others = [lobe for n, lobe in enumerate(self.lobes) if n != k]
-            if float(gains[0]) < KEPT * left or any(are_one(self.lobes[k], other) for other in others):
+            if not float(gains[0]) >= KEPT * left or any(are_one(self.lobes[k], other) for other in others):
                 del self.lobes[k], self.pictures[k]
             else:
                 k += 1

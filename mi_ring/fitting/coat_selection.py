@@ -15,7 +15,8 @@ from mi_ring.fitting.model import Model
 from mi_ring.fitting.optimisation import Optimisation
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
-from mi_ring.nets.brdf_net import COAT, BRDFNet, Parameter
+from mi_ring.geometry.hull import evenly_spaced
+from mi_ring.nets.brdf_net import COAT, BRDFNet
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
@@ -43,16 +44,17 @@ class Evidence(NamedTuple):
     roughness: float = 0.5  #: width
 
 
-def select_lobes(
+def select_coat(
     problem: Problem, model: Model, renderer: Renderer, optimisation: Optimisation, capture: Capture
 ) -> dict[str, float]:
     """Add a second lobe to the material of a fit, in place, if the photographs show one.
 
     `capture`: the capture with the masks that are used now. Returns the evidence as a dict, which is empty if the
-    material has no place for another lobe.
+    material has no place for another lobe, and if photographs have no lights of their own: the room's light from all
+    sides hardly shows the shape of a highlight.
     """
     ring = model.ring
-    if problem.config.parameters or not takes_coat(ring):
+    if problem.config.parameters or problem.capture.photographs.dark or not takes_coat(ring):
         return {}
     found = problem.processes.on_first(lambda: evidence(problem, model, renderer, capture))
     if found.gain > ENOUGH:
@@ -90,7 +92,7 @@ def begin_coat(ring: FittedObject, found: Evidence) -> list[tuple[nn.Parameter, 
     relative = max(found.coat / float(ring.brdf_net.scale), 1e-3)
     starts = relative + math.log(-math.expm1(-relative)), math.log(found.roughness / (1 - found.roughness))
     return ring.brdf_net.add_parameters([  # type: ignore[operator]
-        Parameter(p.name, p.channels, p.low, p.high, start) for p, start in zip((strength, width), starts)
+        p._replace(start=start) for p, start in zip((strength, width), starts)
     ])  # fmt: skip
 
 
@@ -101,7 +103,8 @@ def evidence(problem: Problem, model: Model, renderer: Renderer, capture: Captur
     everywhere, follows by least squares for each of several roughnesses. Compared are means over pixels of equal angle
     to the highlight. Two halves of the photographs must agree.
     """
-    chosen = problem.fitted[np.unique(np.linspace(0, len(problem.fitted) - 1, MOST).round().astype(int))]
+    lit = np.intersect1d(problem.fitted, problem.capture.photographs.mainly)
+    chosen = lit[evenly_spaced(len(lit), MOST)]
     level = min(problem.config.levels[0], 4)
     surface, profiles = renderer.show(model, level), []
     for index in capture.together(chosen):
@@ -118,7 +121,7 @@ def group_profiles(
     `index`: indices of the photographs. `scale`: they are compared this many times smaller.
     """
     calibration = model.calibration
-    photographs = problem.capture.photographs.select(index, capture.shots[index[0]].size, scale)
+    photographs = problem.capture.selected(index, scale)
     seen = capture.observe(index, scale)
     observed = seen.rgb
     if calibration:
