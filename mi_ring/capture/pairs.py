@@ -33,8 +33,8 @@ def with_room_photographs(capture: Capture) -> Capture:
             index.append(k)
             shots.append(room_photograph(shot, {other.name for other in shots}))
     if not index:
-        raise InputError(f"{capture.path}: --pairs both: no photograph with a mask names an image `ambient` of its own; "
-                         "leave it out")  # fmt: skip
+        raise InputError(f"{capture.path}: --pairs both: no photograph with a mask names an image `ambient` of its "
+                         "own; leave it out")  # fmt: skip
     readers = [partial(read_photograph, shot, capture.path) for shot in shots[len(capture) :]]
     images = Pixels([*capture.images.readers, *readers], capture.images.kept)
     masks, valid = (
