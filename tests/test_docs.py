@@ -232,7 +232,7 @@ def values(tmp_path):
             "calibrated": True, "film": film, "emitter": light,
         }],
         "flash": [{}],
-        "room": [{"harmonics": " ".join(["0.1"] * 27), "frame": "camera"}],
+        "room": [{"harmonics": " ".join(["0.1"] * 27), "frame": "camera", "lobes": "0 3 4 50 1 2 3"}],
         "shapenet": [
             {"weights": str(tmp_path / "ring.pt"), "subdivisions": 1, "to_world": moved, "flash": False},
             {"domain": str(tmp_path / "ball.ply"), "center": [1, 2, 3], "radius": 2.0, "subdivisions": 1,
@@ -240,7 +240,7 @@ def values(tmp_path):
              "bsdf": {"type": "cooktorrance", "diffuse": grey, "specular": 0.2, "roughness": 0.4}},
         ],
         "cooktorrance": [{"diffuse": grey, "specular": 0.2, "roughness": 0.4, "diffuse_roughness": 0.1,
-                          "distribution": "beckmann", "fresnel": True}],
+                          "distribution": "beckmann", "fresnel": True, "coat": 0.1, "coat_roughness": 0.2}],
         "merl": [{"filename": str(networks), "material": "one"}],
         "table": [{"to_world": moved, "bsdf": {"type": "diffuse", "reflectance": grey}}],
         "photometric": [{"shadows": False}],

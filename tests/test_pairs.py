@@ -118,7 +118,7 @@ def test_what_is_open_of_pairs_and_of_others(pairs):
     assert refined_of(one, mi_ring.Config(), "capture", 0.5) == ()
     with pytest.raises(InputError, match="some photographs have a light of their own, others none, but --light auto"):
         mi_ring.choose_lighting(others, mi_ring.Config(light="auto"))
-    with pytest.raises(InputError, match="ambient: is subtracted.*leave out --light environment: the fit finds"):
+    with pytest.raises(InputError, match="ambient: is subtracted.*leave out --light environment; --pairs both"):
         mi_ring.choose_lighting(both, mi_ring.Config(light="environment"))
 
 

@@ -32,6 +32,8 @@ from mi_ring.system.progress import progress
 
 PLACES = {"point": "position", "directional": "direction"}  #: what says where a light is
 MANY = 2**28  #: if photographs have more pixels in total, at first only their headers are read
+#: Photographs without a light of their own, if others have one: fewer hardly tell the room's light.
+FEWEST_DARK = 3
 
 
 def load_capture(
@@ -70,6 +72,10 @@ def load_capture(
         capture.photographs  # noqa: B018 (refuses lights that cannot be rendered)
     except SceneError as error:
         raise InputError(f"{path}: {error}") from error
+    dark = [shot.name for shot, lit in zip(shots, capture.photographs.lit) if not lit]
+    if capture.photographs.mixed and len(dark) < FEWEST_DARK:
+        raise InputError(f'{path}: photograph "{dark[0]}": its light is 0 strong, must be positive. 0 is for '
+                         f"photographs in the light of the room alone, at least {FEWEST_DARK}")  # fmt: skip
     if not images:
         return capture
     for shot in shots:
@@ -84,6 +90,9 @@ def load_capture(
     by_brightness = masks != "given" and not any(given.given)
     if pairs == "both":
         capture = with_room_photographs(capture)
+        if len(capture) == len(shots):
+            raise InputError(f"{path}: --pairs both: no photograph with a mask names an image `ambient` of its own; "
+                             "leave it out")  # fmt: skip
         shots, pixels, given, valid = capture.shots, capture.images, capture.masks, capture.valid
     many = sum(math.prod(shot.size) for shot in shots) > MANY
     for shot in shots if many or width else ():

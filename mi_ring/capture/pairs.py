@@ -13,7 +13,6 @@ import numpy as np
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import read_photograph
 from mi_ring.capture.pixels import Pixels
-from mi_ring.errors import InputError
 from mi_ring.scene.shot import Shot
 
 
@@ -22,7 +21,7 @@ def with_room_photographs(capture: Capture) -> Capture:
 
     They follow the others. Each has the camera, the mask and the response of the photograph that names it. An image is
     left out if it is a photograph of the capture already, or if the photograph that names it has no mask: a lit
-    background would be taken for the object. No file is read. Raises InputError if no image is left.
+    background would be taken for the object. No file is read.
     """
     known = {real(shot.files.filename) for shot in capture.shots}
     index, shots = [], list(capture.shots)
@@ -33,8 +32,7 @@ def with_room_photographs(capture: Capture) -> Capture:
             index.append(k)
             shots.append(room_photograph(shot, {other.name for other in shots}))
     if not index:
-        raise InputError(f"{capture.path}: --pairs both: no photograph with a mask names an image `ambient` of its "
-                         "own; leave it out")  # fmt: skip
+        return capture
     readers = [partial(read_photograph, shot, capture.path) for shot in shots[len(capture) :]]
     images = Pixels([*capture.images.readers, *readers], capture.images.kept)
     masks, valid = (

@@ -136,8 +136,8 @@ def flash_slope(calibration: Calibration, index: np.ndarray, directions: Tensor,
     `directions` (N, H, W, 3): of the pixels' rays, in the camera's axes. `normals` (N, H, W, 3): in the axes of the
     world. All points count as equally far as the object's centre.
 
-    The brightness is n · v / |v|³, with the vector v from the point to the light. Its derivative is
-    n / (n · v) − 3 v / |v|².
+    The brightness is n · v / r³, with the vector v of length r from the point to the light. The derivative of its
+    logarithm is n / (n · v) − 3 v / r².
     """
     views, center = calibration(), calibration.rig.center
     cameras = views.cameras[index].detach()

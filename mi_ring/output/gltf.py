@@ -67,11 +67,11 @@ def metallic_roughness(bsdf: str, values: dict[str, np.ndarray]) -> Material:
 
     ``diffuse`` is exact in glTF. ``principled`` without other lobes is nearly exact. Raises InputError for other BSDFs.
     """
-    kind = ElementTree.fromstring(bsdf).get("type")
-    value, params = Values(bsdf, values), mi.traverse(load_bsdf(bsdf))
+    value = Values(bsdf, values)
+    kind, params = value.kind, mi.traverse(value.bsdf)
     zero = np.zeros(value.count, np.float32)
     if kind == "cooktorrance":
-        diffuse, gloss, widths, scale = shares(bsdf, values)
+        diffuse, gloss, widths, scale = shares(value)
         above = gloss[:, 1:].sum(1)  # 0 without a coat
         coat = np.minimum(above / COAT_F0, 1)
         both = np.stack([gloss[:, 0], above - COAT_F0 * coat][: gloss.shape[1]], 1)
@@ -102,8 +102,8 @@ class Values:
     """
 
     def __init__(self, bsdf: str, values: dict[str, np.ndarray]) -> None:
-        self.kind, self.values = ElementTree.fromstring(bsdf).get("type"), values
-        self.fixed = constant_values(load_bsdf(bsdf))
+        self.bsdf, self.values = load_bsdf(bsdf), values
+        self.kind, self.fixed = ElementTree.fromstring(bsdf).get("type"), constant_values(self.bsdf)
         self.count = len(next(iter(values.values())))
 
     def __contains__(self, name: str) -> bool:
@@ -118,9 +118,8 @@ class Values:
         return constant if channels == 3 else constant[:, 0]
 
 
-def shares(bsdf: str, values: dict[str, np.ndarray]) -> Shares:
-    """Compute what the parts of a `cooktorrance` reflect. Arguments as those of `metallic_roughness`."""
-    value = Values(bsdf, values)
+def shares(value: Values) -> Shares:
+    """Compute what the parts of a `cooktorrance` reflect."""
     rough = value("diffuse_roughness") if "diffuse_roughness" in value else np.zeros(value.count, np.float32)
     matte = math.pi * value("diffuse", 3) * ((1 + MEAN * rough) / (1 + DARKER * rough))[:, None]
     lobes = [("specular", "roughness"), ("coat", "coat_roughness")][: 1 + ("coat" in value)]

@@ -79,7 +79,7 @@ def write_scene(
     ElementTree.SubElement(shape, "string", name="filename", value=files[1].name)
     element, scale = ElementTree.fromstring(bsdf), 1.0
     if element.get("type") == "cooktorrance":
-        matte, gloss, widths, scale = gltf.shares(bsdf, values)
+        matte, gloss, widths, scale = gltf.shares(gltf.Values(bsdf, values))
         weight = gloss.sum(1).clip(0, 1)
         distribution = next((e.get("value", "") for e in element if e.get("name") == "distribution"), "ggx")
         element = ElementTree.SubElement(shape, "bsdf", type="blendbsdf")

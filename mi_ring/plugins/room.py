@@ -31,7 +31,7 @@ class Room(InvisibleEmitter):
     ``harmonics`` string  radiance R, G, B of each real harmonic, in the order of ``dr.sh_eval``          P, ∂
                           (l, m = 0, 0; 1, −1; 1, 0; … 2, 2; …): 3, 12, 27, 48 or 75 numbers. Exposed
                           as an array
-    ``lobes``     string  7 numbers of each lobe, up to 32: x, y, z of d, κ (0.1 to 100,000), and R, G, B  P, ∂
+    ``lobes``     string  7 numbers of each lobe, up to 32: x, y, z of d, κ (0.1 to 100,000), R, G, B     P, ∂
                           of c, at least 0. Exposed as an array. Default: no lobes
     ``frame``     string  axes of harmonics and lobes: ``world``, or ``camera`` for those of the rendered
                           `photograph`; then black for other kinds of sensors. Default: ``world``

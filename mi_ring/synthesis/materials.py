@@ -28,7 +28,7 @@ NAMED: dict[str, dict[str, Any]] = {
     "varnish": {"type": "principled", "base_color": {"type": "rgb", "value": [0.45, 0.22, 0.09]}, "roughness": 0.7,
                 "specular": 0.5, "clearcoat": 1.0, "clearcoat_gloss": 0.85},
 }  # fmt: skip
-FORMS = ("brass, varnish, a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, or a plugin with its "
+FORMS = ("a file .xml with one <bsdf>, a .binary of MERL, FILE.npz:MATERIAL, brass, varnish, or a plugin with its "
          "parameters")  # fmt: skip
 
 
