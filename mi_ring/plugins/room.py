@@ -33,8 +33,8 @@ class Room(InvisibleEmitter):
                           as an array
     ``lobes``     string  7 numbers of each lobe, up to 32: x, y, z of d, κ (0.1 to 100,000), R, G, B     P, ∂
                           of c, at least 0. Exposed as an array. Default: no lobes
-    ``frame``     string  axes of harmonics and lobes: ``world``, or ``camera`` for those of the rendered
-                          `photograph`; then black for other kinds of sensors. Default: ``world``
+    ``frame``     string  axes of harmonics and lobes: ``world``, or ``camera`` for those of the
+                          rendered `photograph`; then black for other sensors. Default: ``world``
     ============= ======= ============================================================================= =====
 
     The emitter lights every photograph, but cameras do not see it: the background stays black. A fit with ``--refine
