@@ -28,6 +28,7 @@ from mi_ring.scene.mesh_attributes import require_attributes
 from mi_ring.scene.shot import Shot
 from mi_ring.scene.visibility import MaskedCamera
 from mi_ring.scene.xml_elements import require_parts
+from mi_ring.system.machine import release_scenes
 from mi_ring.system.progress import progress
 
 PLACES = {"point": "position", "directional": "direction"}  #: what says where a light is
@@ -58,6 +59,8 @@ def load_capture(
     if masks not in ("given", "auto", "none"):
         raise InputError(f"masks: is {masks}, must be one of given, auto, none")
     require_variant(path)
+    if images:
+        release_scenes()
     scene, shots = open_scene(path)
     shapes = [s for s in scene.shapes() if isinstance(s, shapenet.ShapeNetMesh)]
     if len(shapes) != 1:

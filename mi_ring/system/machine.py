@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import gc
 import math
 import os
 import platform
@@ -229,6 +230,15 @@ def keep_memory() -> None:
     mallopt = glibc("mallopt")
     mallopt(M_MMAP_THRESHOLD, LARGE_ARRAY)
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def release_scenes() -> None:
+    """Free Mitsuba's objects that nobody uses any more, but that refer to each other.
+
+    As long as they live, Dr.Jit compiles them into the kernels of all other scenes: a second fit in one process may
+    take four times as long.
+    """
+    gc.collect()
 
 
 def release_memory() -> None:
