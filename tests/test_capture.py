@@ -1,8 +1,10 @@
 """Scenes to tensors: decoding, masks, the normalising sphere, and one clear line for what is wrong."""
 
+import gc
 import io
 import re
 import shutil
+import weakref
 from dataclasses import replace
 
 import mitsuba as mi
@@ -423,3 +425,20 @@ def test_a_jpeg_that_ends_too_early_is_refused(tmp_path):
         (tmp_path / "a.jpg").write_bytes(content[: int(share * len(content))])
         with pytest.raises(InputError, match=r"a.jpg: cannot be read as image \(image file is truncated"):
             pixels_of(tmp_path / "a.jpg")
+
+
+def test_reading_a_capture_frees_scenes_that_nobody_uses(small_capture):
+    """Objects that refer to each other, as scenes do, which Dr.Jit would compile into the kernels of the next fit."""
+
+    class Scene:
+        pass
+
+    one = Scene()
+    one.itself, gone = one, weakref.ref(one)
+    gc.disable()
+    try:
+        del one
+        load_capture(small_capture)
+        assert gone() is None
+    finally:
+        gc.enable()
