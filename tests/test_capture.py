@@ -438,7 +438,7 @@ def test_reading_a_capture_frees_scenes_that_nobody_uses(small_capture):
     gc.disable()
     try:
         del one
-        load_capture(small_capture)
+        loading.load_capture(small_capture)
         assert gone() is None
     finally:
         gc.enable()
