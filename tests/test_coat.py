@@ -340,7 +340,7 @@ def test_the_stock_scene_is_the_same_sum():
     """Two blends of Mitsuba's own BSDFs, with the weights that the file has."""
     values = {"diffuse": np.array([BASE[0]]), "specular": np.array([BASE[1]]), "roughness": np.array([BASE[2]]),
               "coat": np.array([COAT[0]]), "coat_roughness": np.array([COAT[1]])}  # fmt: skip
-    matte, gloss, widths, scale = gltf.shares(COATED, values)
+    matte, gloss, widths, scale = gltf.shares(gltf.Values(COATED, values))
     assert scale == 1
     weight = float(gloss.sum())
     lobes = [
