@@ -225,7 +225,7 @@ def test_scene_files_say_lobes_and_environment_maps_show_them():
 
 
 @pytest.mark.parametrize(("lobes", "message"), [
-    ("1 0 0 20 1 1", "must be 0 or 7"), ("0 0 0 20 1 1 1", "must not be 0"), ("1 0 0 0 1 1 1", "its sharpness 0"),
+    ("1 0 0 20 1 1", "must be 0 or 7"), ("0 0 0 20 1 1 1", "must not be 0"), ("1 0 0 0 1 1 1", "sharpness is 0"),
     ("1 0 0 20 1 -1 1", "must not be negative"),
 ])  # fmt: skip
 def test_wrong_lobes_are_refused(lobes, message):
