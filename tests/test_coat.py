@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 from conftest import AXES, CENTER
+from helpers.ellipsoid_points import ellipsoid_points
 from helpers.microfacets import CONTEXT, direction, directions, draw, evaluate, interaction, twin, vectors
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -212,19 +213,9 @@ ONE, TWO = [(0.03, 0.35)], [(0.03, 0.35), (0.004, 0.07)]  #: lobes: (strength, r
 def glossy(scene, folder, lobes):
     """A copy of the small capture whose ellipsoid has these lobes as well, by rays and normals in closed form."""
     shutil.copytree(scene.parent, folder)
-    turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
     for shot in load_capture(scene).shots:
         width, height = shot.size
-        v, u = np.mgrid[:height, :width] + 0.5
-        rays = shot.camera.directions(np.stack([u.ravel(), v.ravel()], 1))
-        start, along = (shot.camera.position - CENTER) @ turn / AXES, rays @ turn / AXES
-        a, b, c = (along**2).sum(1), along @ start, start @ start - 1
-        inside = b**2 > a * c
-        away = (-b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a
-        on_sphere = start + away[:, None] * along
-        normals = on_sphere / AXES @ turn.T
-        toward = shot.light.vector - (CENTER + (on_sphere * AXES) @ turn.T)
-        n, i, o = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (normals, toward, -rays))
+        inside, toward, n, i, o = ellipsoid_points(shot)
         frames = np.linalg.qr(np.concatenate([n[..., None], np.repeat(np.eye(3)[None], len(n), 0)], -1))[0]
         frames[..., 0] *= np.sign((frames[..., 0] * n).sum(1))[:, None]
         local = [np.einsum("nij,ni->nj", frames, x)[:, [1, 2, 0]] for x in (i, o)]

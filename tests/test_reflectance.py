@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from conftest import AXES, CENTER
+from helpers.ellipsoid_points import ellipsoid_points
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from mi_ring import fit
 from mi_ring.capture import reflectance
@@ -220,18 +219,9 @@ def test_bsdf_by_reference(broken_capture, tmp_path):
 def roughened(scene, folder, sigma):
     """A copy of the small capture whose ellipsoid is a rough matte surface, by rays and normals in closed form."""
     shutil.copytree(scene.parent, folder)
-    turn = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
     for shot in load_capture(scene).shots:
         width, height = shot.size
-        v, u = np.mgrid[:height, :width] + 0.5
-        rays = shot.camera.directions(np.stack([u.ravel(), v.ravel()], 1))
-        start, along = (shot.camera.position - CENTER) @ turn / AXES, rays @ turn / AXES
-        a, b, c = (along**2).sum(1), along @ start, start @ start - 1
-        away = (-b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a
-        on_sphere = start + away[:, None] * along
-        normals = on_sphere / AXES @ turn.T
-        toward = shot.light.vector - (CENTER + (on_sphere * AXES) @ turn.T)
-        n, i, o = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (normals, toward, -rays))
+        _, _, n, i, o = ellipsoid_points(shot)
         n_i, n_o = ((n * x).sum(1).clip(0.02) for x in (i, o))
         beside = (i * o).sum(1) - n_i * n_o
         factor = (1 + sigma * beside / np.where(beside > 0, np.maximum(n_i, n_o), 1)) / (1 + 0.288 * sigma)
