@@ -2,7 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -22,14 +22,19 @@ from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.scene.shot import Shot
 from mi_ring.system.files import write_file
 
-#: A photograph and the light of its room: spherical harmonics (BASIS, 3), perhaps lobes. None: no such light.
-Lit: TypeAlias = tuple[Shot, np.ndarray | None] | tuple[Shot, np.ndarray | None, Lobes | None]
+
+class Lit(NamedTuple):
+    """A photograph and the light of its room. None: no such light."""
+
+    shot: Shot
+    room: np.ndarray | None = None  #: (BASIS, 3) spherical harmonics
+    lobes: Lobes | None = None
 
 
 def first_photograph(run: Path) -> Lit:
     """Read scene.xml in the results folder `run`.
 
-    Returns (first photograph, room light as spherical harmonics (BASIS, 3) or None, lobes of the room light or None).
+    Returns the first photograph and the light of the room.
     Raises InputError if there is no scene.xml, or if neither the photograph nor the room has a light.
     """
     if not run.is_dir():
@@ -39,7 +44,7 @@ def first_photograph(run: Path) -> Lit:
     if room is None and not shots[0].own_light.rgb.any():
         raise InputError(f"{run}/scene.xml: a scene for Mitsuba needs the photographs' own light, and there is "
                          "none; export OBJ or GLB and light it yourself")  # fmt: skip
-    return shots[0], room, lobes_of(scene)
+    return Lit(shots[0], room, lobes_of(scene))
 
 
 def write_scene(
