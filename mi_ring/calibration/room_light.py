@@ -140,6 +140,27 @@ class RoomLight(nn.Module):
         over all processes; default: one process.
         """
 
+        which = [k for k in around.harmonics if k < len(self.vector[0])]  # without lobes beside a flash
+        equations = total(torch.cat(self.equations(around, len(which), predicted, observed, counted), 1))
+        if not bool(equations.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
+            return
+        self.matrix *= MEMORY
+        self.vector *= MEMORY
+        self.shown *= MEMORY
+        matrix, vector, shown = equations.split([len(which) ** 2, len(which), len(which) + 1], 1)
+        self.matrix[:, torch.tensor(which)[:, None], which] += matrix.unflatten(1, (len(which), -1))
+        self.vector[:, which] += vector
+        self.shown[:, [*which, -1]] += shown
+        self.update(progress)
+
+    def equations(
+        self, around: GlobalIllumination, count: int, predicted: Tensor, observed: Tensor, counted: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Compute the normal equations of photographs for J = `count` strengths, the first of `around`.
+
+        Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The rest is as in `solve`.
+        """
+
         def pooled(pictures: Tensor, factor: int) -> Tensor:
             means = F.avg_pool2d(pictures.movedim(-1, 1), factor, ceil_mode=True, count_include_pad=False)
             return means.movedim(1, -1)
@@ -154,48 +175,39 @@ class RoomLight(nn.Module):
 
         inside = torch.minimum(small(counted.float()[..., None])[..., 0], alpha) > OBJECT
         missing, seen = small(observed - predicted)[inside], small(observed)[inside]
-        now, rows = self.strengths[around.harmonics], len(self.vector[0])
+        now = self.strengths[around.harmonics]
         lit = torch.einsum("jnhwc,jc->nhwc", around.unoccluded, now)
-        fixed = [n for n, k in enumerate(around.harmonics) if k >= rows]  # lobes beside a flash
-        if fixed:
-            lit = lit - torch.einsum("jnhwc,jc->nhwc", around.transfer[fixed], now[fixed])
-        which, now = around.harmonics[: len(now) - len(fixed)], now[: len(now) - len(fixed)]
-        pictures = around.transfer[: len(which)]
-        basis = torch.stack([pooled(picture, coarser)[inside] for picture in pictures])  # (which, n, 3)
+        lit = lit - torch.einsum("jnhwc,jc->nhwc", around.transfer[count:], now[count:])
+        basis = torch.stack([pooled(picture, coarser)[inside] for picture in around.transfer[:count]])  # (J, n, 3)
         missing = missing + pooled(lit, coarser)[inside]
         scale = seen.mean(-1) + DIM * self.exposure
-        left = missing - torch.einsum("jnc,jc->nc", basis, now)
+        left = missing - torch.einsum("jnc,jc->nc", basis, now[:count])
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
         matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
         shown = torch.einsum("jnc,nc,n->cj", torch.cat([basis, seen[None]]), seen, weight)
-        equations = total(torch.cat([matrix, vector[..., None], shown[:, :-1, None]], -1))
-        brightness = total(shown[:, -1])  # finite if the others are
-        if not bool(equations.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
-            return
-        self.matrix *= MEMORY
-        self.vector *= MEMORY
-        self.shown *= MEMORY
-        self.matrix[:, torch.tensor(which)[:, None], which] += equations[..., :-2]
-        self.vector[:, which] += equations[..., -2]
-        self.shown[:, which] += equations[..., -1]
-        self.shown[:, -1] += brightness
+        return matrix.flatten(1), vector, shown
+
+    def update(self, progress: float) -> None:
+        """Set the light to the solution of the normal equations. Does nothing before they tell each harmonic."""
         told = self.matrix.diagonal(dim1=1, dim2=2)[:, self.used].mean(1)
-        if bool((told > 0).all()):
-            free = self.free if progress >= FINE else harmonics_up_to(BESIDE_FLASH, self.frames)
-            self.harmonics = self.given.clone()
-            if self.alone and (count := int(self.count)):
-                self.log_sharpness.clamp_(*map(math.log, SHARPNESS))
-                found = self.solved_with_lobes(self.matrix, self.vector, free, count)
-                self.harmonics[free], self.flux[:count] = found
-            else:
-                ridge = RIDGE * told[:, None, None] * torch.eye(rows).to(self.matrix)
-                given = F.pad(self.given.T, (0, rows - BASIS))
-                right = self.vector[..., None] - self.matrix @ given[..., None]
-                more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
-                self.harmonics[free] += self.believed(more, free) * more.T
-            # A room with negative mean radiance is impossible: another part of the model is too bright then.
-            self.harmonics[:, self.harmonics[0] < 0] = 0.0
+        if not bool((told > 0).all()):
+            return
+        free = self.free if progress >= FINE else harmonics_up_to(BESIDE_FLASH, self.frames)
+        self.harmonics = self.given.clone()
+        if self.alone and (count := int(self.count)):
+            self.log_sharpness.clamp_(*map(math.log, SHARPNESS))
+            found = self.solved_with_lobes(self.matrix, self.vector, free, count)
+            self.harmonics[free], self.flux[:count] = found
+        else:
+            rows = len(self.vector[0])
+            ridge = RIDGE * told[:, None, None] * torch.eye(rows).to(self.matrix)
+            given = F.pad(self.given.T, (0, rows - BASIS))
+            right = self.vector[..., None] - self.matrix @ given[..., None]
+            more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
+            self.harmonics[free] += self.believed(more, free) * more.T
+        # A room with negative mean radiance is impossible: another part of the model is too bright then.
+        self.harmonics[:, self.harmonics[0] < 0] = 0.0
 
     def solved_with_lobes(self, matrix: Tensor, vector: Tensor, free: list[int], count: int) -> tuple[Tensor, Tensor]:
         """Solve normal equations with lobes, whose fluxes must not be negative.

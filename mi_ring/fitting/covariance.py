@@ -28,7 +28,8 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.plain_mesh import POSITIONS
 
-COMPARED_WIDTH, SPP = 96, 8  #: of the compared pictures: largest width [px], samples per pixel
+COMPARED_WIDTH, SPP = 96, 4  #: of the compared pictures: largest width [px], samples per pixel
+LEVEL = 5  #: of the mesh in them, at most
 ROOM, DIM = 10.0, 0.01  #: prior and step of the room's light [exposure]
 STEP = 0.2  #: of the unknowns to either side [standard deviations of their priors]
 BLOCK = 8  #: width of blocks of pixels whose errors are taken to be correlated
@@ -79,12 +80,12 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
     Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown. The room's light is
     "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. All fitted photographs are rendered.
-    `level`: level of the rendered mesh. Colours and silhouettes eliminate the surface separately, so its prior counts
-    twice.
+    `level`: level of the mesh of the results; a coarser one is rendered if it is fine. Colours and silhouettes
+    eliminate the surface separately, so its prior counts twice.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None
-    layout = Layout(calibration)
+    layout, level = Layout(calibration), min(level, LEVEL)
     surface = renderer.show(model, level)
     patches = Patches(surface, ring.domain.sample(level)[0], float(ring.radius), ring.brdf_net.bsdf_parameters)
     colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))
