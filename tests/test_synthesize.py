@@ -17,6 +17,7 @@ import mi_ring
 from mi_ring import check, synthesize
 from mi_ring.capture.decoding import decode
 from mi_ring.errors import InputError
+from mi_ring.fitting.small_lights import fibonacci
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
@@ -109,16 +110,20 @@ def test_a_lambertian_plane_is_as_bright_as_it_must_be(kind):
 
 
 @pytest.mark.parametrize("in_camera", [False, True])
-def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
-    """Order l of the room's radiance brings π, 2π/3, π/4 times as much irradiance (Ramamoorthi and Hanrahan 2001)."""
+@pytest.mark.parametrize("kind", ["harmonics", "windows"])
+def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(kind, in_camera):
+    """Order l of the room's radiance brings π, 2π/3, π/4 times as much irradiance (Ramamoorthi and Hanrahan 2001).
+
+    That of windows is a sum over directions.
+    """
     ball = trimesh.creation.icosphere(subdivisions=5)
     scene = ObjectOnTable(lambert(mesh_of(ball.vertices, ball.faces), ALBEDO), ball.vertices)
     camera = camera_at([5, 9, -14], [0.05, 0.02, 0], (27, 21))
     camera = camera._replace(focal=np.array([150.0, 165.0]), centre=np.array([13.1, 10.7]))
-    room = light_sources.random_room("harmonics", in_camera, np.random.default_rng(4))
-    seen = mi.Bitmap(light_sources.room_envmap(room, camera.to_world).astype(np.float32))
+    room, windows = light_sources.random_room(kind, in_camera, np.random.default_rng(4))
+    seen = mi.Bitmap(light_sources.room_envmap(room, camera.to_world, lobes=windows).astype(np.float32))
     lamp = mi.load_dict({"type": "envmap", "bitmap": seen})
-    found = scene.radiance(LensCamera(camera), lamp, 256, 5, 2)
+    found = scene.radiance(LensCamera(camera), lamp, 1024, 5, 2)
     d = rays(camera)
     half = -(d @ camera.position)
     root = half**2 - camera.position @ camera.position + 1
@@ -130,8 +135,13 @@ def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(in_camera):
     order = np.repeat([np.pi, 2 * np.pi / 3, np.pi / 4], [1, 3, 5])
     harmonics = np.vstack([room[:1], room[PER_FRAME : PER_FRAME + 8]]) if in_camera else room[:9]
     irradiance = (np.array(basis).T @ (order[:, None] * harmonics)).reshape(*hit.shape, 3)
+    if windows is not None:
+        toward = fibonacci(20_000)
+        radiance = windows.radiance(toward, camera.to_world) * 4 * np.pi / len(toward)
+        irradiance += np.maximum(n @ toward.T, 0) @ radiance
+        assert np.linalg.norm(windows.mean_radiance()) > 1.3 * np.linalg.norm(harmonics[0]) / np.sqrt(4 * np.pi)
     assert hit.sum() > 100
-    error = (found / np.maximum(ALBEDO / np.pi * irradiance, 1e-9) - 1)[hit]  # of 256 paths: 1.5 % each
+    error = (found / np.maximum(ALBEDO / np.pi * irradiance, 1e-9) - 1)[hit]  # of 1024 paths: 1 % each
     assert np.abs(error).max() < 0.1 and np.abs(error.mean(0)).max() < 0.004
 
 
@@ -199,6 +209,21 @@ def test_a_pair_tells_the_flash_from_the_room(lump, tmp_path):
         room = lit - alone.images[k]
         assert room[both.masks[k] > 0].min() > 0.01  # what would be missing
         np.testing.assert_allclose(both.images[k], alone.images[k], atol=1e-3 * lit.max())
+
+
+def test_photographs_without_a_light_of_their_own_show_the_room_alone(lump, tmp_path):
+    """As a pair does; the exact scene file has the windows, in the axes of the camera."""
+    size = ["--views", "2", "--size", "28", "20", "--spp", "9", "--novel", "0", "--cameras", "turntable"]
+    room = ["--room", "1", "--room-kind", "windows"]
+    synthesize.main([str(lump), str(tmp_path / "pair"), *size, *room, "--pairs", "--exposure", "0.5"])
+    exposure = ["--exposure", str(0.5 * np.pi)]  # of a surface in a room, instead of one that a flash lights
+    synthesize.main([str(lump), str(tmp_path / "dark"), *size, *room, "--light", "none", "--wrong-room", *exposure])
+    for k in range(2):
+        np.testing.assert_array_equal(*(read_image(tmp_path / folder / f"{k:03}.exr")
+                                        for folder in ("pair/ambient", "dark/images")))  # fmt: skip
+    given, exact = (mi_ring.load_capture(tmp_path / "dark" / name) for name in ("scene.xml", "truth/exact.xml"))
+    assert given.photographs.room is None and given.photographs.dark
+    assert len(exact.photographs.lobes) == 3 and all(exact.photographs.lobes.in_camera)
 
 
 def test_an_interrupted_capture_goes_on(matt, lump, tmp_path):
@@ -425,6 +450,7 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--lamps", "2"], "--lamps: is 2, which is for --light lamp"),
     (["--light", "lamp", "--lamps", "9"], "--lamps: is 9, must be 1 to 8"),
     (["--cameras", "turntable", "--light", "lamp"], "--cameras: is turntable; an --environment"),
+    (["--light", "none"], "--light: is none; give --room 1"),
     (["--light", "moon"], "--light: is moon; must be one of"),
 ])  # fmt: skip
 def test_mistakes_are_told_in_one_line_before_any_work(options, message, lump, tmp_path):

@@ -7,15 +7,18 @@ import numpy as np
 from mi_ring.geometry.camera import Camera
 from mi_ring.rendering.spherical_harmonics import BASIS, PER_FRAME, room_envmap
 from mi_ring.scene.lights import Light
+from mi_ring.scene.lobes import Lobes
 
-LightKind = Literal["flash", "point", "distant", "lamp"]
-RoomKind = Literal["constant", "harmonics"]
+LightKind = Literal["flash", "point", "distant", "lamp", "none"]
+RoomKind = Literal["constant", "harmonics", "windows"]
 
 LOW_ORDERS = 9  #: number of spherical harmonics of orders 0 to 2, which a room has
 TINT, CONTRAST = 0.12, 0.5  #: of a room's light: variation of the colours, standard deviation of each harmonic
 CANDIDATES = 4  #: random directions for a further lamp; the one farthest from the other lamps is taken
 WEAKEST = 0.4  #: least intensity of a further lamp [intensity of the first lamp]
 DARKEST = 0.15  #: least radiance of a room in any direction [its mean radiance]
+WINDOWS, OF_WINDOWS = 3, 0.6  #: in a room of this kind, and their share of its light
+SHARPNESS = 20.0, 300.0  #: of a window, between which its logarithm is drawn
 
 
 def lights_of(
@@ -26,12 +29,14 @@ def lights_of(
 
     `kind`: "flash": a point light fixed to the camera, at `offset`; "point" or "distant": a point or directional light
     in a random direction at most `spread` [deg] from the camera, seen from the origin; "lamp": a point light in a
-    random direction at `distance` from the origin, the same for all cameras. `offset`: position of the flash relative
-    to the lens, left, up and forward [distance from the camera to the origin].
+    random direction at `distance` from the origin, the same for all cameras; "none": black. `offset`: position of the
+    flash relative to the lens, left, up and forward [distance from the camera to the origin].
 
     The median irradiance of a surface at the origin that faces its light is 1 W/m². All point lights have the same
     intensity.
     """
+    if kind == "none":
+        return [Light("point", camera.position, np.zeros(3)) for camera in cameras]
     if kind == "flash":
         places = [c.position + np.linalg.norm(c.position) * c.to_world[:3, :3] @ offset for c in cameras]
     elif kind == "lamp":
@@ -74,18 +79,36 @@ def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Gener
     return np.linalg.norm(position) * (cosine * axis + np.sqrt(1 - cosine**2) * across)
 
 
-def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> np.ndarray:
-    """Draw the light of a random room. Returns spherical harmonics (BASIS, 3) of its RGB radiance, with mean about 1.
+def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> tuple[np.ndarray, Lobes | None]:
+    """Draw the light of a random room. Returns spherical harmonics (BASIS, 3) of its RGB radiance, and small lights.
 
-    `kind`: "constant": the same radiance from all directions; "harmonics": it varies with the direction. `in_camera`:
-    True: the light is fixed to the camera; False: it is fixed in the world.
+    The mean radiance is about 1. `kind`: "constant": the same radiance from all directions; "harmonics": it varies with
+    the direction; "windows": so does it, and there are small lights. `in_camera`: True: the light is fixed to the
+    camera; False: it is fixed in the world.
     """
     colour = 1 + TINT * random.uniform(-1, 1, 3)
     room = np.zeros((BASIS, 3))
     room[0] = colour * np.sqrt(4 * np.pi)  # the first harmonic is 1 / sqrt(4 pi)
-    if kind == "harmonics":
+    if kind != "constant":
         waves = random.normal(0, CONTRAST, (LOW_ORDERS - 1, 1)) * colour
         darkest = (room_envmap(np.vstack([np.zeros(3), waves]), np.eye(4)) / colour).min()
         first = PER_FRAME if in_camera else 1
         room[first : first + LOW_ORDERS - 1] = waves * min(1.0, (1 - DARKEST) / -darkest)
-    return room
+    if kind != "windows":
+        return room, None
+    return (1 - OF_WINDOWS) * room, random_windows(in_camera, random)
+
+
+def random_windows(in_camera: bool, random: np.random.Generator) -> Lobes:
+    """Draw `WINDOWS` small lights, of different directions, widths and colours. Their mean radiance is `OF_WINDOWS`."""
+    toward = random.normal(size=(1, 3))
+    while len(toward) < WINDOWS:
+        candidates = random.normal(size=(CANDIDATES, 3))
+        candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
+        toward = np.vstack([toward, candidates[(candidates @ toward.T).max(1).argmin()]])
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    least, most = np.log(SHARPNESS)
+    sharpness = np.exp(random.uniform(least, most, WINDOWS))
+    flux = random.uniform(WEAKEST, 1, (WINDOWS, 1)) * (1 + TINT * random.uniform(-1, 1, (WINDOWS, 3)))
+    flux *= OF_WINDOWS * 4 * np.pi / flux.mean(1).sum()
+    return Lobes(toward, sharpness, flux, np.full(WINDOWS, in_camera))

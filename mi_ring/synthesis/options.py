@@ -82,7 +82,8 @@ class SynthesizeConfig:
     flash: a point light at the lens, or beside the lens by --offset.
     point: a point light elsewhere, in another place for each photograph, as far from the object as the camera.
     distant: parallel light, from another direction for each photograph.
-    lamp: a point light that is in the same place for all photographs."""
+    lamp: a point light that is in the same place for all photographs.
+    none: there is only the light of --room."""
     lamps: int = 1
     """Number of lamps that shine in all photographs, 1 to 8. Only with --light lamp.
     Give 2 or more to test the command fit with --light lamps or --refine lamps.
@@ -99,7 +100,8 @@ class SynthesizeConfig:
     photographs from a room that is not dark."""
     room_kind: RoomKind = "constant"
     """How the light of --room depends on the direction.
-    constant: the same from all sides. harmonics: stronger from some sides, by spherical harmonics of order 2."""
+    constant: the same from all sides. harmonics: stronger from some sides, by spherical harmonics of order 2.
+    windows: like harmonics, and three small bright lights."""
     pairs: bool = False
     """Render each view a second time, under the light of --room alone. The scene file names these second photographs as
     `ambient`. A fit subtracts them from the others."""
@@ -193,7 +195,9 @@ def require_options(config: SynthesizeConfig) -> None:
         raise InputError("--elevations: has cameras below the table; give 1 degree or more, or leave out --table")
     if config.cameras == "turntable" and (config.environment or config.light == "lamp"):
         raise InputError("--cameras: is turntable; an --environment or a --light lamp would turn with the object; give "
-                         "--room 0.2 --room-kind harmonics, which stands still like the camera")  # fmt: skip
+                         "--room 0.2 --room-kind windows, which stands still like the camera")  # fmt: skip
+    if config.light == "none" and (not config.room or config.environment or config.pairs):
+        raise InputError("--light: is none; give --room 1, and neither --environment nor --pairs")
     if config.distance is not None and not 1.05 <= config.distance <= 1000:
         raise InputError(f"--distance: is {config.distance}, must be 1.05 to 1000 radii of the object")
     if config.pattern != "stripes" and not config.second:

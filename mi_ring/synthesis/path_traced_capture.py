@@ -73,11 +73,17 @@ class Studio:
             bsdf = pattern.blend(bsdf, second)
         self.shape = shape_of(self.mesh, colours, bsdf, pattern)
         self.environment = self.environment_element() if config.environment else None  #: replaces all other lights
-        self.room = light_sources.random_room(config.room_kind, config.cameras == "turntable", self.random(1))
+        turning = config.cameras == "turntable"
+        self.room, self.windows = light_sources.random_room(config.room_kind, turning, self.random(1))
         self.room_level = config.room / np.pi  #: mean radiance of the room; the photographs' light brings 1 W/m²
         self.tables: list[Element] = []  #: elements of the scene file
         self.spp = int(np.ceil(np.sqrt(config.spp))) ** 2  #: paths per pixel, a square number
         self.gains = exposures(config.views, config.wrong_exposure, self.random(6))  #: (views, 3)
+
+    @property
+    def lit(self) -> bool:
+        """True if photographs have lights of their own."""
+        return self.environment is None and self.config.light != "none"
 
     def random(self, *purpose: int) -> np.random.Generator:
         """Make a random generator from the option --seed and the integers `purpose`.
@@ -153,6 +159,8 @@ class Studio:
         number. `scale`: factor by which width and height of the picture are divided.
         """
         depth, view = self.config.depth, LensCamera(taken.camera.shrunk(scale))
+        if self.environment is None and not self.lit:
+            return np.zeros((*reversed(view.camera.size), 3))
         light = taken.light if self.environment is None else load_element(self.environment)
         picture = scene.radiance(view, light, spp, taken.seed, depth, hidden=self.environment is None)
         for n, lamp in enumerate(self.further_lamps(taken.light), 1):
@@ -167,7 +175,7 @@ class Studio:
         view = LensCamera(taken.camera.shrunk(scale))
         if not self.config.room:
             return np.zeros((*reversed(view.camera.size), 3))
-        room = self.room_level * room_envmap(self.room, taken.camera.to_world)
+        room = self.room_level * room_envmap(self.room, taken.camera.to_world, lobes=self.windows)
         light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(room.astype(np.float32))})
         return scene.radiance(view, light, spp, taken.seed + 1, self.config.depth)
 
@@ -180,7 +188,7 @@ class Studio:
         """
         config = self.config
         if config.exposure is not None:
-            return config.exposure * (1.0 if self.environment is not None else np.pi)
+            return config.exposure * (np.pi if self.lit else 1.0)
         values, scale = [], max(1, min(TRIAL_SCALE, min(config.size) // 8))
         for photograph in photographs[:: -(-len(photographs) // TRIALS)]:
             inside = scene.coverage(LensCamera(photograph.camera.shrunk(scale)), 16) > 0.9
@@ -244,12 +252,13 @@ def write_scenes(
     them. `exposure`: pixel value of radiance 1.
     """
     config, out = studio.config, studio.config.out
-    strength = exposure if studio.environment is None else 0.0
+    strength = exposure if studio.lit else 0.0
     emitters: list[Element] = []
     if studio.environment is not None:
         emitters = [studio.environment_element(exposure)]
     elif config.room:
-        emitters = room_elements(exposure * studio.room_level * studio.room)
+        level = exposure * studio.room_level
+        emitters = room_elements(level * studio.room, lobes=studio.windows and studio.windows.scaled(level))
     for lamp in studio.further_lamps((seen + novel)[0].light):
         emitters.append(emitter_element(lamp._replace(rgb=strength * lamp.rgb)))
     # For pairs the room is unknown, but not that it stood still while the object turned.
