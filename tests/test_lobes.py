@@ -157,7 +157,7 @@ def test_the_emitter_is_to_stock_integrators_what_lobes_are_to_ours():
     }
     lit, dark = load(LIGHTS, **parts, **rooms), load(LIGHTS, **parts)
     photographs = Photographs.of([sensor.shot for sensor in dark.sensors()], None, lobes_of(lit))
-    which = photographs.harmonics
+    which = photographs.room_rows
     assert which == [BASIS, BASIS + 1, BASIS + 2]
 
     def path(scene, seed):
@@ -165,7 +165,7 @@ def test_the_emitter_is_to_stock_integrators_what_lobes_are_to_ours():
         return np.stack([np.array(mi.render(scene, sensor=k, integrator=integrator, spp=64, seed=seed + k))[..., :3]
                          for k in range(2)])  # fmt: skip
 
-    channels = indirect_light.render_indirect(dark, photographs, 64, 1, harmonics=which)
+    channels = indirect_light.render_indirect(dark, photographs, 64, 1, rows=which)
     both = np.moveaxis(pictures(channels[4:]).reshape(2, HEIGHT, WIDTH, 2, 3, 3), (3, 4), (0, 1))
     ours, once = np.einsum("sjnhwc,jc->snhwc", both, photographs.room_strengths[which]).mean((2, 3))
     theirs = (path(lit, 7) - path(dark, 7)).mean((1, 2))

@@ -77,7 +77,7 @@ def test_a_ball_shows_the_convolution_with_the_cosine():
     ball = {"type": "sphere", "center": CENTER.tolist(), "radius": 0.5, "bsdf": material(ALBEDO / np.pi)}
     scene = load(LIGHTS, ball=ball)
     photographs = Photographs.of([sensor.shot for sensor in scene.sensors()])
-    channels = indirect_light.render_indirect(scene, photographs, spp=256, seed=1, harmonics=ALL)
+    channels = indirect_light.render_indirect(scene, photographs, spp=256, seed=1, rows=ALL)
     images, free = (np.moveaxis(part, 0, 3) for part in shown(channels))
     inside = pictures(channels[:4])[..., 3] == 1
     assert inside[0].sum() > 60 and inside[1].sum() > 60
@@ -115,7 +115,7 @@ def test_the_emitter_is_to_stock_integrators_what_the_harmonics_are_to_ours():
                          for k in range(2)])  # fmt: skip
 
     def ours(seed):
-        channels = indirect_light.render_indirect(dark, photographs, 64, seed, harmonics=which)
+        channels = indirect_light.render_indirect(dark, photographs, 64, seed, rows=which)
         return np.einsum("jnhwc,jc->nhwc", shown(channels, which)[0], room[which])
 
     def regions(picture):
@@ -141,7 +141,7 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     added = np.array(image)[..., :3] - plain[..., :3]
     assert (added[:8] == 0).all() and (added[:, :8] == 0).all()  # beside the object
     channels = indirect_light.render_indirect(
-        dark, Photographs.of([sensor.shot for sensor in dark.sensors()]), 64, 5, harmonics=ALL
+        dark, Photographs.of([sensor.shot for sensor in dark.sensors()]), 64, 5, rows=ALL
     )
     ours = np.einsum("jnhwc,jc->nhwc", shown(channels)[0], room[ALL])[1]
     np.testing.assert_allclose(added.mean((0, 1)), ours.mean((0, 1)), rtol=0.02)
@@ -188,7 +188,7 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     room = RoomLight(torch.zeros(BASIS, 3), float(observed.mean()), frames).to(machine.device())
     surface = SimpleNamespace(scene=dark, table=None, unit=1.0)
     for seed in range(8):
-        around = GlobalIllumination.of(surface, photographs, direct[..., 3], seed, 70, 64, harmonics=room.which)
+        around = GlobalIllumination.of(surface, photographs, direct[..., 3], seed, 70, 64, rows=room.which)
         predicted = direct[..., :3] + around.interreflection
         lit_so_far = replace(photographs, room=room.harmonics.double().cpu().numpy())
         free = torch.from_numpy(pictures(render_photographs(dark, lit_so_far, 64, 0))).to(direct) - direct

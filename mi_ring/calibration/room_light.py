@@ -140,7 +140,7 @@ class RoomLight(nn.Module):
         over all processes; default: one process.
         """
 
-        which = [k for k in around.harmonics if k < len(self.vector[0])]  # without lobes beside a flash
+        which = [k for k in around.rows if k < len(self.vector[0])]  # without lobes beside a flash
         equations = total(torch.cat(self.equations(around, len(which), predicted, observed, counted), 1))
         if not bool(equations.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
             return
@@ -175,7 +175,7 @@ class RoomLight(nn.Module):
 
         inside = torch.minimum(small(counted.float()[..., None])[..., 0], alpha) > OBJECT
         missing, seen = small(observed - predicted)[inside], small(observed)[inside]
-        now = self.strengths[around.harmonics]
+        now = self.strengths[around.rows]
         lit = torch.einsum("jnhwc,jc->nhwc", around.unoccluded, now)
         lit = lit - torch.einsum("jnhwc,jc->nhwc", around.transfer[count:], now[count:])
         basis = torch.stack([pooled(picture, coarser)[inside] for picture in around.transfer[:count]])  # (J, n, 3)

@@ -216,12 +216,12 @@ class CovarianceGroup:
         room = torch.cat([calibration.room_harmonics().cpu(), lobe_fluxes(photographs)])
         if indirect or room.any() or unknown:
             around = GlobalIllumination.of(self.surface, photographs, coverage.to(self.problem.device), 1, paths=SPP,
-                                         indirect=indirect, harmonics=calibration.room.which)  # fmt: skip
+                                         indirect=indirect, rows=calibration.room.which)  # fmt: skip
             bounced = around.interreflection.cpu() if indirect else bounced
             added = around.occlusion if self.dark else around.room_light
             room_light = added(room.to(self.problem.device)).cpu() if room.any() else room_light
             if unknown:
-                chosen = [around.harmonics.index(k) for k in calibration.room.free]
+                chosen = [around.rows.index(k) for k in calibration.room.free]
                 transfer = torch.stack([around.upsampled(around.transfer[k]).cpu() for k in chosen])
         return bounced, room_light, transfer
 

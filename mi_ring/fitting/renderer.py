@@ -104,7 +104,7 @@ class Renderer:
             bounced = other.interreflection
             linear = linear + (calibration.indirect(bounced) if calibration else bounced)
         without_room = linear.detach()
-        if other and photographs.harmonics:
+        if other and photographs.room_rows:
             linear = linear + other.occlusion(torch.from_numpy(photographs.room_strengths).to(linear))
         rgb = calibration.recorded(linear, batch.photographs, batch.scale) if calibration else linear
         return Prediction(vertices, material, rgb, coverage, photographs, other, averages, without_room, self.surface)
@@ -129,13 +129,13 @@ class Renderer:
         `coverage` (n, H, W): the object's share of each pixel. Returns (None, {}) if there is neither light. If the
         scene has a table, interreflection is averaged over iterations. Otherwise the averages are {}.
         """
-        calibration, indirect, harmonics = model.calibration, model.ring.indirect, photographs.harmonics
+        calibration, indirect, rows = model.calibration, model.ring.indirect, photographs.room_rows
         if calibration and calibration.solves_room(batch.progress):
-            harmonics = calibration.room.which
-        if not (indirect or harmonics):
+            rows = calibration.room.which
+        if not (indirect or rows):
             return None, {}
         other = GlobalIllumination.of(self.surface, photographs, coverage, batch.seeds["indirect"],
-                                    harmonics=harmonics, indirect=indirect)  # fmt: skip
+                                    rows=rows, indirect=indirect)  # fmt: skip
         return averaged(self.averages, other, batch) if indirect and self.surface.table is not None else (other, {})
 
     def remember(self, prediction: Prediction) -> Prediction:

@@ -75,7 +75,7 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     unit = "mm" if capture.shape.metres == 1e-3 else "scene units"
     place = "Object: centre ({:.5g}, {:.5g}, {:.5g}), radius about {:.5g}".format(*center, radius) + f" [{unit}]"
     photographs, light = capture.photographs, []
-    if photographs.dark and not photographs.harmonics:
+    if photographs.dark and not photographs.room_rows:
         light = ["Light: the photographs have no light of their own; mi-ring fit --light auto finds it"]
     elif photographs.mixed:
         dark = np.sum(~photographs.lit)

@@ -27,7 +27,7 @@ class GlobalIllumination:
     """
 
     radiance: Tensor  #: (N, h, w, 3) of interreflection
-    harmonics: list[int]  #: rows of `Photographs.room_strengths`, n of them: harmonics and lobes of the room light
+    rows: list[int]  #: rows of `Photographs.room_strengths`, n of them: harmonics and lobes of the room light
     #: (n, N, h, w, 3) radiance in a room whose radiance is one of these harmonics or lobes; 0 if the room's light does
     #: not reach a photograph
     transfer: Tensor
@@ -40,7 +40,7 @@ class GlobalIllumination:
     @classmethod
     def of(
         cls, surface: Surface, photographs: Photographs, coverage: Tensor, seed: int, width: int | None = None,
-        paths: int | None = None, indirect: bool = True, harmonics: Sequence[int] = (),
+        paths: int | None = None, indirect: bool = True, rows: Sequence[int] = (),
     ) -> "GlobalIllumination":  # fmt: skip
         """Render small pictures of interreflection and room light for the current surface, without gradients.
 
@@ -48,7 +48,7 @@ class GlobalIllumination:
         side of the small pictures [px]. `paths`: paths per pixel. If these are None: 32 px and 16 paths, or 128 px and
         3 paths if the scene has a table. This light varies slowly, so a few good pixels are better than many noisy
         ones. `indirect`: False: no interreflection; the room light then has its occlusion, but is reflected only once.
-        `harmonics`: see the attribute; empty: no room light.
+        `rows`: see the attribute; empty: no room light.
         """
         bounces = BOUNCES if indirect else 1
         table = surface.table if indirect else None  # a table reflects light; alone it would hide the room's
@@ -56,15 +56,15 @@ class GlobalIllumination:
         width, paths = width or usual[0], paths or usual[1]
         factor = -(-max(photographs.size) // width)
         small = photographs.select(np.array(photographs.index), photographs.size, factor).in_units(surface.unit)
-        channels = evaluated(render_indirect(surface.scene, small, paths, seed, bounces, harmonics, table))
+        channels = evaluated(render_indirect(surface.scene, small, paths, seed, bounces, rows, table))
         *rgb, alpha = (channel.reshape(small.shape) for channel in channels[:4])
         basis = channels[4:] or [alpha.new_zeros(0)]
-        transfer, unoccluded = torch.cat(basis).reshape(2, len(harmonics), 3, *small.shape).movedim(2, -1)
+        transfer, unoccluded = torch.cat(basis).reshape(2, len(rows), 3, *small.shape).movedim(2, -1)
         reached = photographs.in_room[np.array(photographs.index)]
         if not reached.all():
             transfer, unoccluded = (part * torch.from_numpy(reached).to(part)[:, None, None, None]
                                     for part in (transfer, unoccluded))  # fmt: skip
-        return cls(torch.stack(rgb, -1), list(harmonics), transfer, unoccluded, alpha, coverage, factor)
+        return cls(torch.stack(rgb, -1), list(rows), transfer, unoccluded, alpha, coverage, factor)
 
     @property
     def interreflection(self) -> Tensor:
@@ -77,19 +77,19 @@ class GlobalIllumination:
     def room_light(self, room: Tensor) -> Tensor:
         """Compute the linear radiance (N, H, W, 3) that room light adds to the photographs at full size.
 
-        It includes the shadows of the room light. `room`: as `Photographs.room_strengths`; only the rows in
-        `harmonics` count.
+        It includes the shadows of the room light. `room`: as `Photographs.room_strengths`; only those in
+        `rows` count.
         """
-        return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.harmonics]))
+        return self.upsampled(torch.einsum("jnhwc,jc->nhwc", self.transfer, room[self.rows]))
 
     def occlusion(self, room: Tensor) -> Tensor:
         """Compute what to add to photographs at full size that contain room light that is reflected once.
 
         Returns linear radiance (N, H, W, 3): the shadows of harmonics, as negative values, and interreflection. `room`:
-        as `Photographs.room_strengths`; only the rows in `harmonics` count.
+        as `Photographs.room_strengths`; only those in `rows` count.
         """
         difference = self.transfer - self.unoccluded
-        return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.harmonics]))
+        return self.upsampled(torch.einsum("jnhwc,jc->nhwc", difference, room[self.rows]))
 
     def upsampled(self, rgb: Tensor) -> Tensor:
         """Enlarge small pictures `rgb` (N, h, w, 3) to the photographs' full size (N, H, W, 3), with sharp outlines.

@@ -10,7 +10,7 @@ from mi_ring.rendering.spherical_harmonics import BASIS, bsdfs_with_lobes, evalu
 BOUNCES = 3  #: points of a path after the first surface
 
 
-def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=(), table=None):
+def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, rows=(), table=None):
     """Render interreflection. Returns [R, G, B, coverage], Floats of N·H·W pixels without gradients.
 
     R, G, B are linear radiance. Paths start at the camera and sample BSDFs. After the first point, a path has at most
@@ -18,7 +18,7 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
     longer paths are missing. `spp`: paths per pixel. `table`: a scene of tables, which paths can hit after their first
     point; it casts no shadows. None: no table.
 
-    `harmonics`: n indices of spherical harmonics; indices from BASIS on are those of all lobes of `photographs`. For
+    `rows`: n indices of spherical harmonics; indices from BASIS on are those of all lobes of `photographs`. For
     these, 6 n more Floats follow. The first 3 n are R, G, B of the radiance transfer of each harmonic: the radiance of
     the surface in a room whose radiance is this harmonic, with shadows and interreflection; for a lobe, its flux is 1.
     The last 3 n are the same without interreflection, those of harmonics also without shadows and without noise.
@@ -28,22 +28,22 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, harmonics=()
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
         covered = dr.select(hit.is_valid(), mi.Float(1), 0)
         lane = dr.compress(hit.is_valid())  # the background takes no time from here on
-        channels = [dr.zeros(mi.Float, dr.width(covered)) for _ in range(3 + 6 * len(harmonics))]
+        channels = [dr.zeros(mi.Float, dr.width(covered)) for _ in range(3 + 6 * len(rows))]
         if dr.width(lane):
             ray, view = dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, view, lane)
             si = dr.gather(mi.PreliminaryIntersection3f, hit, lane).compute_surface_interaction(ray)
             random = next_2d(seed ^ 0x2545F491, dr.width(lane), lane + photographs.first_lane(spp))
             pose = photographs.camera(view).to_world
-            bsdfs = bsdfs_with_lobes(scene) if harmonics else []
-            smooth = [k for k in harmonics if k < BASIS]
-            lobes = photographs.lobes if len(smooth) < len(harmonics) else None
+            bsdfs = bsdfs_with_lobes(scene) if rows else []
+            smooth = [k for k in rows if k < BASIS]
+            lobes = photographs.lobes if len(smooth) < len(rows) else None
             unoccluded = reflected_harmonics(bsdfs, si, pose, smooth, si.is_valid()) if smooth else []
             direct = lobes.reflected(scene, bsdfs, si, pose, random, si.is_valid()) if lobes else []
             radiance, escaped, blocked, bounced = trace_paths(
                 scene, si, view, photographs, bounces, random, table, bsdfs, lobes
             )
             values = [*radiance]
-            if harmonics:
+            if rows:
                 added, removed = (
                     [value * throughput for value in evaluated_harmonics(direction, pose, smooth)] if smooth else []
                     for throughput, direction in (escaped, blocked)

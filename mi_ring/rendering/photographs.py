@@ -171,7 +171,7 @@ class Photographs:
         return not (self.colocated or self.dark)
 
     @property
-    def harmonics(self) -> list[int]:
+    def room_rows(self) -> list[int]:
         """Indices of the rows of `room_strengths` that are not 0, and of all lobes."""
         used = [] if self.room is None else np.flatnonzero(self.room.any(1)).tolist()
         return used + [BASIS + j for j in range(len(self.lobes or ()))]
@@ -206,7 +206,7 @@ class Photographs:
         the harmonics of the room light; lobes cast shadows. Its result carries gradients. Returns None if there is no
         room light. `view`: photograph of each lane, for room light that is fixed to the camera.
         """
-        which = self.harmonics
+        which = self.room_rows
         if not which:
             return None
 

@@ -114,12 +114,12 @@ def draw(
         parts.append(evaluated(render_photographs(surface.scene, own, spp, seed, shadows, pixels=pixels)))
     *colours, coverage = (torch.cat(channel).reshape(photographs.shape) for channel in zip(*parts))
     rgb = torch.stack(colours, dim=-1)
-    if indirect or (occlusion and photographs.harmonics):
-        harmonics = photographs.harmonics
-        added = GlobalIllumination.of(surface, photographs, coverage, seed + 1, 128, paths, indirect, harmonics)
+    if indirect or (occlusion and photographs.room_rows):
+        rows = photographs.room_rows
+        added = GlobalIllumination.of(surface, photographs, coverage, seed + 1, 128, paths, indirect, rows)
         if indirect:
             rgb = rgb + added.interreflection
-        if harmonics and occlusion:
+        if rows and occlusion:
             rgb = (rgb + added.occlusion(torch.from_numpy(photographs.room_strengths).to(rgb))).clamp(min=0)
     if surface.texture:
         with without_gloss(surface) as is_other:
