@@ -9,7 +9,7 @@ scene file does not mention them. `--light environment` finds shape, material an
 next of the three environments. --flash adds a flash capture of the same views.
 
 Prints a Markdown table: errors of normals and depth; the angle between the brightest directions of the true and of the
-found map, both as harmonics of order 4; the angle between the radiance-weighted mean directions; PSNR of the relit
+found map, both blurred by about 10 degrees; the angle between the radiance-weighted mean directions; PSNR of the relit
 object, after one factor per colour.
 """
 
@@ -27,10 +27,12 @@ import numpy as np
 import torch
 from accuracy import processor, product_speed, table
 
+from mi_ring.fitting.small_lights import fibonacci
 from mi_ring.images import read_image, write_image
-from mi_ring.rendering.spherical_harmonics import BASIS, PER_FRAME, envmap_directions, room_envmap, world_harmonics
+from mi_ring.rendering.spherical_harmonics import envmap_directions, room_envmap
 
 ROWS = 128  #: of a map
+BLUR, CANDIDATES = 60.0, 10_000  #: sharpness of a blurred light, and directions that are compared
 PLASTIC = "principled base_color=0.6,0.45,0.3 roughness=0.4"
 #: Photographs under another light, and paths per pixel. They are half as wide as others, so that so many are not too
 #: slow: with fewer the noise of the sun's light would be larger than the error.
@@ -64,25 +66,19 @@ def maps() -> dict[str, np.ndarray]:
     return {"overcast": overcast, "indoor": indoor, "sun": sky + sun * np.array([55.0, 50, 42])}
 
 
-def as_harmonics(radiance: np.ndarray) -> np.ndarray:
-    """(BASIS, 3) of a map, by a sum over its pixels."""
+def whole(radiance: np.ndarray) -> np.ndarray:
+    """(3,) the direction from which the light of a map comes on the whole."""
     away, weight = envmap_directions(len(radiance))
-    room = np.zeros((BASIS, 3))
-    room[:PER_FRAME] = world_harmonics(away) * weight @ radiance.reshape(-1, 3)
-    return room
-
-
-def whole(room: np.ndarray) -> np.ndarray:
-    """(3,) the direction from which the light of harmonics comes on the whole."""
-    away, weight = envmap_directions(ROWS)
-    total = weight * (room[:PER_FRAME].mean(1) @ world_harmonics(away)) @ away
+    total = weight * radiance.mean(-1).ravel() @ away
     return total / np.linalg.norm(total)
 
 
-def brightest(room: np.ndarray) -> np.ndarray:
-    """(3,) the direction in which harmonics are brightest."""
-    grey = room_envmap(room, np.eye(4)).mean(-1)
-    return directions(len(grey)).reshape(-1, 3)[grey.argmax()]
+def brightest(radiance: np.ndarray) -> np.ndarray:
+    """(3,) the direction in which a map, blurred by about 10 degrees, is brightest."""
+    away, weight = envmap_directions(len(radiance))
+    grey, candidates = weight * radiance.mean(-1).ravel(), fibonacci(CANDIDATES)
+    blurred = [np.exp(BLUR * (some @ away.T - 1)) @ grey for some in np.array_split(candidates, 50)]
+    return candidates[np.concatenate(blurred).argmax()]
 
 
 def run(*arguments: object) -> str:
@@ -133,8 +129,8 @@ def main() -> None:
             lit = [] if light == "flash" else ["--environment", args.out / f"{light}.exr", "--wrong-room"]
             run("mi_ring.synthesize", mesh, capture, "--views", args.views, "--spp", args.spp,
                 "--size", args.width, args.width, *usual, *lit)  # fmt: skip
-            found = [] if light == "flash" else ["--light", "environment"]
-            run("mi_ring.fit", capture / "scene.xml", "--out", fit, *found, *options)
+            kind = [] if light == "flash" else ["--light", "environment"]
+            run("mi_ring.fit", capture / "scene.xml", "--out", fit, *kind, *options)
             truth = capture / "truth/mesh.ply"
             numbers = json.loads(run("mi_ring.evaluate", fit, "--mesh", truth))
             seconds = json.loads((fit / "log.jsonl").read_text().splitlines()[-1])["seconds"]
@@ -148,10 +144,9 @@ def main() -> None:
                 run("mi_ring.synthesize", mesh, relit, "--views", RELIT, "--seed", 7, *usual, "--spp", SMOOTH,
                     "--size", args.width // 2, args.width // 2, "--environment", args.out / f"{other}.exr")  # fmt: skip
                 calibrated = mi_ring.load_capture(fit / "scene.xml", images=False)
-                rooms = as_harmonics(own[light]), calibrated.photographs.room
-                off = [
-                    np.degrees(np.arccos(np.clip(np.dot(*map(toward, rooms)), -1, 1))) for toward in (brightest, whole)
-                ]
+                found = room_envmap(calibrated.room, np.eye(4), ROWS, calibrated.lobes)
+                off = [np.degrees(np.arccos(np.clip(toward(own[light]) @ toward(found), -1, 1)))
+                       for toward in (brightest, whole)]  # fmt: skip
                 row += [*(f"{angle:.1f}" for angle in off), f"{relit_psnr(fit, relit):.1f}"]
             rows.append([*row, f"{seconds:.0f}"])
             print(*rows[-1], sep=", ", file=sys.stderr, flush=True)

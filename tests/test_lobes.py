@@ -271,7 +271,7 @@ def in_the_sun(tmp_path_factory):
 def test_a_search_finds_a_small_light_and_none_in_smooth_light(in_the_sun, in_an_environment):
     """On the surface from which a fit starts, with the highlights of the ball, or without them."""
     for path, lamps in ((in_the_sun, 1), (in_an_environment, 0)):
-        config = mi_ring.Config.preset("fast", **TINY, light="environment", small_lights=8)
+        config = mi_ring.Config.preset("fast", **TINY, light="environment")
         fit = mi_ring.Fit(mi_ring.load_capture(path), config, lighting=Lighting("environment"))
         show = fit.renderer.show
         if lamps:
@@ -296,7 +296,7 @@ def test_a_fit_moves_lobes_continues_with_them_and_writes_them(in_the_sun, tmp_p
     """From one 10° off. No search helps."""
     monkeypatch.setattr(schedule, "LIGHTS_SOUGHT", ())
     capture = mi_ring.load_capture(in_the_sun)
-    config = mi_ring.Config.preset("fast", **TINY | {"iterations": 3}, light="environment", small_lights=8)
+    config = mi_ring.Config.preset("fast", **TINY | {"iterations": 3}, light="environment")
     fit = mi_ring.Fit(capture, config, lighting=Lighting("environment"))
     start = Lobes(unit(*np.add(TOWARD, [0, 0, 0.18]))[None], np.array([40.0]), np.ones((1, 3)), np.array([False]))
     fit.model.calibration.room.place(start)

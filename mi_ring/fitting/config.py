@@ -115,9 +115,9 @@ class Tuning:
     """Iterations of each stage, from coarse to fine, as a share of all: one number above 0 for each of --levels.
     Only the ratios count. A larger last number gives finer detail and takes longer. A fit that starts from a hull or a
     mesh skips two thirds of the iterations of the first stage. It adds 40 % of the skipped iterations to the second."""
-    small_lights: int = 0
+    small_lights: int = 8
     """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
-    Only if the room is the only light. 0: none are sought. Give 8 if the light was small and the object is glossy."""
+    Only if the room is the only light. The fit adds those that photographs show. 0: none are sought."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
     A fit with --detail chooses the level itself, 7 or 8 for most captures.
@@ -321,5 +321,6 @@ PRESETS: dict[str, dict] = {
         "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
         "precision": "float32", "domain": "sphere", "masks": "given", "shadows": False, "indirect": False,
         "refine": ("none",), "detail": "none", "diffuse": "lambert", "lobes": "1",
+        "small_lights": 0,
     },
 }  # fmt: skip

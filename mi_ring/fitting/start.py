@@ -52,10 +52,6 @@ def require_settings(capture: Capture, config: Config, lighting: Lighting | None
                          "the photographs' own lights; leave it out, or find them all by --light lamps")  # fmt: skip
     if config.lobes == "2" and (config.parameters or not hasattr(capture.shape.bsdf(), "lobes")):
         raise InputError(f"{capture.path}: --lobes 2: is for cooktorrance without --parameters; leave it out")
-    lit = config.light == "lamps" or (config.light == "capture" and not capture.photographs.dark)
-    if config.small_lights and lit:
-        raise InputError(f"{capture.path}: --small-lights: is for a room that is the only light; leave it out, or give "
-                         "--light environment or turntable")  # fmt: skip
 
 
 class StateError(InputError):
