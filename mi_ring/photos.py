@@ -38,6 +38,7 @@ from mi_ring.system.optional import need
 from mi_ring.system.progress import Part, Steps, progress
 
 OPTIONS = "work/options.json"  #: the options of the command that made the capture
+MADE = "scene.xml", "images", "masks", "valid", "table.png"  #: what the command may write, besides `work`
 METRES = 1e-3  #: length of a scene unit if there is a sheet [m]
 
 
@@ -174,8 +175,9 @@ def main(arguments: Sequence[str]) -> None:
     scene, sheet = config.out / "scene.xml", config.out / "check.png"
     require_apart(config)
     if scene.exists() and (sheet.exists() or read_json(config.out / OPTIONS) != config.words()):
+        made = [name for name in MADE if (config.out / name).exists()]
         raise InputError(f"{config.out}: DIR: has a scene.xml already; give another folder. To make it again, remove "
-                         "scene.xml, images/, masks/, valid/ and table.png there, and keep work/")  # fmt: skip
+                         f"{', '.join(made)} there, and keep work/")  # fmt: skip
     try:
         with (
             command.resumable(),
@@ -196,7 +198,7 @@ def require_apart(config: PhotosConfig) -> None:
     """Raise InputError if FOLDER or the folder of --masks is a folder that the command will write."""
     given = {"FOLDER": config.folder} | ({"--masks": config.masks} if isinstance(config.masks, Path) else {})
     out = config.out.resolve()
-    written = [out / name for name in ("images", "masks", "valid", "work")]
+    written = [out / name for name in (*MADE, "work")]
     for field, path in given.items():
         place = path.resolve()
         if place == out or any(place.is_relative_to(taken) for taken in written):
