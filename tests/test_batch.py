@@ -15,6 +15,7 @@ from unittest.mock import Mock
 
 import psutil
 import pytest
+from helpers.quick_fits import BRIEF
 
 from mi_ring import batch
 from mi_ring.collection import fits
@@ -24,8 +25,7 @@ from mi_ring.output import results
 from mi_ring.output.index import Entry, write_index
 from mi_ring.system import command
 
-OPTIONS = ["--iterations", "60", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2", "--batch",
-           "2", "--domain", "sphere", "--deterministic"]  # fmt: skip
+OPTIONS = ["--iterations", "60", "--deterministic", *BRIEF]
 needs_ray = pytest.mark.skipif(
     importlib.util.find_spec("ray") is None or sys.platform == "win32", reason="needs ray, an extra, and /proc"
 )

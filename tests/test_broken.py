@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from helpers.quick_fits import BRIEF
 
 from mi_ring import fit
 from mi_ring.errors import InputError
@@ -231,9 +232,6 @@ BROKEN = {
 }  # fmt: skip
 
 
-QUICK = ["--levels", 2, "--widths", 28, "--shares", 1, "--subdivisions", 2, "--domain", "sphere"]
-
-
 def run(arguments, capsys):
     """Exit status of `python -m mi_ring.fit …` and what it complains of."""
     with pytest.raises(SystemExit) as stop:
@@ -292,7 +290,7 @@ def full_disk(monkeypatch):
 def test_a_full_disk(file, small_capture, tmp_path, capsys, full_disk):
     out = tmp_path / "out"
     full_disk(file)
-    quick = ["--iterations", 5, *QUICK]
+    quick = ["--iterations", 5, *BRIEF]
     status, complaint = run([small_capture, "--out", out, *quick], capsys)
     assert status == 2, complaint
     complaint = complaint.splitlines()[-1]
@@ -310,9 +308,9 @@ def test_after_a_full_disk_the_fit_goes_on(small_capture, tmp_path, monkeypatch,
     out = tmp_path / "out"
     monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0)
     full_disk("checkpoint.pt", nth=4)
-    status, complaint = run([small_capture, "--out", out, "--iterations", 6, *QUICK], capsys)
+    status, complaint = run([small_capture, "--out", out, "--iterations", 6, *BRIEF], capsys)
     assert status == 2 and "checkpoint.pt: cannot be written" in complaint.splitlines()[-1]
     monkeypatch.undo()
-    status, _ = run([small_capture, "--out", out, "--iterations", 6, *QUICK, "--resume"], capsys)
+    status, _ = run([small_capture, "--out", out, "--iterations", 6, *BRIEF, "--resume"], capsys)
     assert status == 0
     assert results.read_log(out)[-1]["iteration"] == 6

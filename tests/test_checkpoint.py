@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 from conftest import CENTER
-from helpers.quick_fits import ITERATIONS, QUICK, SPHERE, TABLE
+from helpers.quick_fits import BRIEF, ITERATIONS, QUICK, SPHERE, TABLE
 
 from mi_ring import fit
 from mi_ring.capture.loading import load_capture
@@ -53,7 +53,7 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(
 
 def test_a_damaged_checkpoint_is_made_good_by_the_one_before(small_capture, tmp_path, monkeypatch, capsys):
     """As in a deterministic fit that nobody disturbed. What is damaged does not take the place of what is not."""
-    quick = [*SPHERE, "--iterations", "6", "--deterministic", "--no-indirect"]
+    quick = [*BRIEF, "--iterations", "6", "--deterministic"]
     folder, path = tmp_path / "run", tmp_path / "run/checkpoint.pt"
     monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0)
     assert fit.main([str(small_capture), "--out", str(folder), *quick]) == 0
@@ -109,7 +109,7 @@ def test_resume_notices_files_that_changed(small_capture, broken_capture, tmp_pa
     path, edit = broken_capture
     trimesh.creation.icosphere(subdivisions=2, radius=30).apply_translation(CENTER).export(path.parent / "ball.ply")
     edit('<bsdf type="cooktorrance"/>', '<string name="domain" value="ball.ply"/><bsdf type="cooktorrance"/>')
-    arguments = [str(path), "--out", str(tmp_path / "run"), "--iterations", "2", "--no-indirect", *SPHERE]
+    arguments = [str(path), "--out", str(tmp_path / "run"), "--iterations", "2", *BRIEF]
     assert fit.main(arguments) == 0
     assert fit.main([*arguments, "--resume"]) == 0  # there is nothing left to do
     for name in ("images/004.png", "masks/005.png", "ball.ply", path.name):

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from helpers.quick_fits import FILES, ITERATIONS, SPHERE, TABLE, distance
+from helpers.quick_fits import BRIEF, FILES, ITERATIONS, SPHERE, TABLE, distance
 from PIL import Image
 
 from mi_ring import fit, render
@@ -48,7 +48,7 @@ def test_steps_of_the_flow_are_part_of_the_result(finished):
 
 def test_of_very_many_photographs_some_are_shown(small_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(capture.Capture.spread, "__defaults__", (5,))
-    assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *SPHERE]) == 0
+    assert fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *BRIEF]) == 0
     page = (tmp_path / "run" / "report.html").read_text()
     assert "12; below are 5 of them" in page and page.count('class="photograph"') == 5
     assert Image.open(tmp_path / "run" / "inputs.png").size == (5 * 160, 16 + 160)  # a line says what is green
@@ -150,8 +150,9 @@ def test_interreflection_is_added_unless_switched_off(small_capture, monkeypatch
 def test_interreflection_is_left_out_where_intensities_cannot_be_true_nor_be_refined(broken_capture, tmp_path, capsys):
     path, _ = broken_capture
     path.write_text(re.sub(r'name="intensity" value="[^"]*"', 'name="intensity" value="1"', path.read_text()))
-    for options, said in (("--refine none", True), ("--refine none --no-indirect", False), ("", False)):
-        command = [str(path), "--out", str(tmp_path / "run"), "--iterations", "1", *SPHERE, *options.split()]
+    cases = {"--indirect --refine none": True, "--refine none": False, "--indirect --refine auto": False}
+    for options, said in cases.items():
+        command = [str(path), "--out", str(tmp_path / "run"), "--iterations", "1", *BRIEF, *options.split()]
         assert fit.main(command) == 0
         assert ("Interreflection is left out" in capsys.readouterr().out) == said
 
@@ -173,7 +174,7 @@ def test_shadows_of_scene_and_command_line_must_agree(broken_capture, monkeypatc
 
 
 def test_a_finished_fit_is_fitted_anew_and_not_silently(finished, tmp_path, capsys):
-    assert fit.main([str(finished / "scene.xml"), "--out", str(tmp_path / "run"), "--iterations", "1", *SPHERE]) == 0
+    assert fit.main([str(finished / "scene.xml"), "--out", str(tmp_path / "run"), "--iterations", "1", *BRIEF]) == 0
     said = "contains a fitted object. The fit ignores it and starts anew"
     assert f"{finished / 'scene.xml'}: {said}" in capsys.readouterr().out
     weights = ElementTree.parse(tmp_path / "run" / "scene.xml").findall("shape/string[@name='weights']")

@@ -13,7 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 import torch
-from helpers.quick_fits import SPHERE
+from helpers.quick_fits import BRIEF
 
 from mi_ring.doctor import DoctorConfig
 from mi_ring.errors import InputError
@@ -394,7 +394,7 @@ from mi_ring import fit
 for out in "ab":
     assert fit.main([*sys.argv[1:], "--out", out, "--iterations", "1", "--threads", "1"]) == 0
 """
-    subprocess.run([sys.executable, "-c", code, path, *SPHERE], check=True, timeout=300, cwd=tmp_path)
+    subprocess.run([sys.executable, "-c", code, path, *BRIEF], check=True, timeout=300, cwd=tmp_path)
 
 
 def test_on_one_core_an_exr_is_written_and_read(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers.quick_fits import SPHERE
+from helpers.quick_fits import BRIEF
 
 from mi_ring import fit
 from mi_ring.capture.loading import load_capture
@@ -18,14 +18,14 @@ def test_a_fit_that_diverges_says_so_and_keeps_what_there_is(small_capture, tmp_
     genuine = terms.rgb_loss
     monkeypatch.setattr(terms, "rgb_loss", lambda *a: genuine(*a) * float("nan"))
     with pytest.raises(InputError, match="diverged at iteration 17"):
-        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "40", "--no-indirect", *SPHERE])
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "40", *BRIEF])
     ring = torch.load(tmp_path / "run" / "ring.pt")["networks"]
     assert all(tensor.isfinite().all() for tensor in ring.values())
 
 
 def test_a_fit_goes_back_from_numbers_that_are_none_and_on_with_smaller_steps(small_capture, monkeypatch):
     """Of weights at once, of losses when there are three in a row; a single one is left out."""
-    changes = {"levels": (2,), "widths": (28,), "shares": (1,), "indirect": False, "refine": ("none",)}
+    changes = {"levels": (2,), "widths": (28,), "shares": (1,), "indirect": False, "refine": ("none",), "batch": 2}
     broken = Fit(load_capture(small_capture), Config(iterations=40, domain="sphere", **changes))
     genuine = terms.rgb_loss
     wrong = {3, 20, 21, 22}

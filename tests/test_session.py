@@ -14,7 +14,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from helpers.quick_fits import FILES, QUICK, SPHERE, distance
+from helpers.quick_fits import BRIEF, FILES, distance
 
 from mi_ring import fit, render
 from mi_ring.capture.loading import load_capture
@@ -73,7 +73,7 @@ def test_signals_outside_the_loop_lose_nothing(moment, number, small_capture, tm
         genuine(*arguments)
 
     monkeypatch.setattr(results, moment, interrupted)
-    status = fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *SPHERE])
+    status = fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *BRIEF])
     never = {"checkpoint.before.pt"} if moment == "write_inputs" else set()  # before the first iteration
     assert {p.name for p in (tmp_path / "run").iterdir()} == set(FILES) - never
     assert status == (128 + number if moment == "write_inputs" else 0)  # at the end there is nothing left to resume
@@ -83,7 +83,7 @@ def test_signals_outside_the_loop_lose_nothing(moment, number, small_capture, tm
 def test_the_second_ctrl_c_says_how_to_go_on(small_capture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(results, "write", lambda *_: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
     with pytest.raises(KeyboardInterrupt):
-        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *SPHERE])
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "2", *BRIEF])
     assert capsys.readouterr().out.endswith("has a checkpoint: go on with the same command and --resume\n")
 
 
@@ -92,7 +92,7 @@ def test_a_photograph_that_changes_during_the_fit_is_named(small_capture, tmp_pa
     photograph = sorted(scene.parent.glob("images/*"))[0]
     monkeypatch.setattr(results, "write_log", lambda *_: photograph.write_bytes(photograph.read_bytes() + b"0"))
     monkeypatch.setattr(results, "write", lambda *_: None)
-    fit.main([str(scene), "--out", str(tmp_path / "run"), "--iterations", "2", *SPHERE])
+    fit.main([str(scene), "--out", str(tmp_path / "run"), "--iterations", "2", *BRIEF])
     assert f"images/{photograph.name}: changed while the fit ran" in capsys.readouterr().out
 
 
@@ -100,7 +100,7 @@ def test_a_photograph_that_changes_during_the_fit_is_named(small_capture, tmp_pa
 def test_the_signal_of_a_terminal_that_closes_loses_nothing(small_capture, tmp_path, begun):
     """However often they come; nor does a reader of the output that is gone, of which nobody hears then."""
     folder, end = tmp_path / "run", signal.SIGHUP
-    options = ["--out", str(folder), "--iterations", "900", *SPHERE]
+    options = ["--out", str(folder), "--iterations", "900", *BRIEF]
     process = begun([sys.executable, "-m", "mi_ring.fit", str(small_capture), *options], folder)
     process.stdout.close()
     reach(process, folder, results.read_log(folder)[-1]["iteration"] + 10)
@@ -121,7 +121,7 @@ def test_a_folder_that_is_removed_comes_back(small_capture, tmp_path, monkeypatc
 
     monkeypatch.setattr(results, "add_to_log", removed)
     monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0)
-    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "10", *SPHERE]) == 0
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "10", *BRIEF]) == 0
     assert sorted(p.name for p in folder.iterdir()) == sorted(set(FILES) - {"inputs.png"})
     assert [entry["iteration"] for entry in results.read_log(folder)] == [5, 10]
 
@@ -136,7 +136,7 @@ def test_a_log_that_was_cut_off_by_a_full_disk_is_whole_again(small_capture, tmp
         raise InputError("log.jsonl: cannot be written (No space left on device); make room")
 
     monkeypatch.setattr(results, "add_to_log", cut_off)
-    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "10", *SPHERE]) == 0
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "10", *BRIEF]) == 0
     assert [entry["iteration"] for entry in results.read_log(folder)] == [5, 10]
     said = "log.jsonl: cannot be written (No space left on device); the fit goes on and tries again"
     assert said in "".join(capsys.readouterr())
@@ -154,7 +154,7 @@ def test_results_that_cannot_go_where_they_should_go_elsewhere(small_capture, tm
     for module in (files, results):
         monkeypatch.setattr(module, "write_file", refused)
     with pytest.raises(InputError, match="as if") as told:
-        fit.main([str(small_capture), "--out", str(folder), "--iterations", "2", *SPHERE])
+        fit.main([str(small_capture), "--out", str(folder), "--iterations", "2", *BRIEF])
     (elsewhere,) = tmp_path.glob("mi_ring-run-*/run")
     assert str(told.value) == f"{folder}/ring.pt: cannot be written (as if); the results are in {elsewhere} instead"
     assert {p.name for p in elsewhere.iterdir()} == set(FILES) - {"inputs.png", "checkpoint.before.pt"}
@@ -177,7 +177,7 @@ def test_results_that_cannot_go_where_they_should_go_elsewhere(small_capture, tm
 
 def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path, begun):
     folder = tmp_path / "run"
-    options = ["--out", str(folder), "--iterations", "40", *SPHERE]
+    options = ["--out", str(folder), "--iterations", "40", *BRIEF]
     process = begun([sys.executable, "-m", "mi_ring.fit", str(small_capture), *options], folder)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=120)
@@ -189,14 +189,14 @@ def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_pa
 
     assert fit.main([str(small_capture), *options, "--resume"]) == 0
     assert [e["iteration"] for e in results.read_log(folder)][-1] == 40
-    assert distance(folder / "mesh.ply") < 0.04
+    assert distance(folder / "mesh.ply") < 0.05
 
 
 def test_results_never_go_onto_the_scene_itself(finished, broken_capture):
     path, _ = broken_capture
     before = path.read_bytes()
     with pytest.raises(InputError, match="holds the scene file"):
-        fit.main([str(path), "--out", str(path.parent), "--iterations", "1", *QUICK])
+        fit.main([str(path), "--out", str(path.parent), "--iterations", "1", *BRIEF])
     with pytest.raises(InputError, match="own photographs"):
         render.main([str(finished), str(path), str(path.parent / "images")])
     assert path.read_bytes() == before
@@ -205,7 +205,7 @@ def test_results_never_go_onto_the_scene_itself(finished, broken_capture):
 def test_a_second_fit_moves_the_first_result_aside(finished, small_capture, tmp_path):
     folder = tmp_path / "small"
     shutil.copytree(finished, folder)
-    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "2", *SPHERE]) == 0
+    assert fit.main([str(small_capture), "--out", str(folder), "--iterations", "2", *BRIEF]) == 0
     before, aside, now = ((place / "mesh.ply").read_bytes() for place in (finished, tmp_path / "small.1", folder))
     assert aside == before != now
 
@@ -213,12 +213,12 @@ def test_a_second_fit_moves_the_first_result_aside(finished, small_capture, tmp_
 def test_an_output_folder_that_is_a_file_is_one_line(small_capture, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="--out: cannot be written"):
-        fit.main([str(small_capture), "--out", str(tmp_path / "file" / "run"), "--iterations", "1", *SPHERE])
+        fit.main([str(small_capture), "--out", str(tmp_path / "file" / "run"), "--iterations", "1", *BRIEF])
 
 
 def test_scenes_of_the_same_name_do_not_share_a_folder_by_default(small_capture, broken_capture, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    quick = ["--iterations", "1", *SPHERE]
+    quick = ["--iterations", "1", *BRIEF]
     assert fit.main([str(small_capture), *quick]) == 0
     assert fit.main([str(small_capture), *quick]) == 0  # the same scene: the first result is moved aside
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["small", "small.1"]
@@ -232,5 +232,5 @@ def test_two_fits_into_one_folder_are_refused(small_capture, tmp_path):
         files.locked(tmp_path / "run"),
         pytest.raises(InputError, match="run: --out: another process is writing there"),
     ):
-        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *SPHERE])
+        fit.main([str(small_capture), "--out", str(tmp_path / "run"), "--iterations", "1", *BRIEF])
     assert not (tmp_path / "run").exists()

@@ -11,6 +11,9 @@ from mi_ring.fitting.iteration import Iteration
 
 QUICK = ["--levels", "2", "3", "--widths", "28", "56", "--shares", "0.6", "0.4", "--batch", "4", "--subdivisions", "3"]
 SPHERE = [*QUICK, "--domain", "sphere"]  # whose sizes are known
+#: Of fits of which only matters what is written, and when. One unknown, so that there is a calibration.
+BRIEF = ["--levels", "2", "--widths", "28", "--shares", "1", "--batch", "2", "--subdivisions", "2",
+         "--domain", "sphere", "--refine", "power", "--no-indirect", "--detail", "none", "--lobes", "1"]  # fmt: skip
 ITERATIONS = 40  #: of the fit that the fixture `finished` makes
 
 
@@ -28,7 +31,7 @@ TABLE = """<shape type="table"><bsdf type="diffuse"/><transform name="to_world">
 def posed(capture, **changes):
     """A fit that finds calibration alone, at its middle, and photographs that show what it predicts; which of them."""
     settings = {"refine": ("cameras",), "levels": (4,), "widths": (56,), "shares": (1.0,), "batch": 4, "spp": 16,
-                "weights": {"calibration": 0.0}}  # the prior alone would find them  # fmt: skip
+                "indirect": False, "weights": {"calibration": 0.0}}  # the prior alone would find them  # fmt: skip
     config = mi_ring.Config(**settings | changes)
     fit = mi_ring.Fit(mi_ring.load_capture(capture), config)
     fit.course.iteration, chosen = fit.iterations // 2, fit.sampler.draw_photographs(config.batch)
