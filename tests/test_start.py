@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 from conftest import AXES, CENTER
-from helpers.quick_fits import QUICK, SPHERE, distance
+from helpers.quick_fits import BRIEF, QUICK, SPHERE, distance
 
 from mi_ring import fit
 from mi_ring.capture.loading import load_capture
@@ -18,6 +18,8 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.geometry.domain import Domain, Sphere
 from mi_ring.objects.ring_file import load_fit
 from mi_ring.output import results
+
+PLAIN = [*QUICK, "--refine", "none", "--no-indirect"]  #: surface and material alone
 
 
 def masks_on_some(path):
@@ -55,7 +57,7 @@ def distant_lights(path):
 def test_captures_of_every_kind_are_fitted(change, broken_capture, tmp_path):
     path, _ = broken_capture
     change(path)
-    quick = SPHERE if change in (two_sizes, distant_lights) else QUICK  # which take longer, from a hull or a mesh
+    quick = SPHERE if change in (two_sizes, distant_lights) else PLAIN  # which take longer, from a hull or a mesh
     assert fit.main([str(path), "--out", str(tmp_path / "run"), "--iterations", "6", *quick]) == 0
     log = results.read_log(tmp_path / "run")
     assert all(np.isfinite(entry["loss"]) for entry in log)
@@ -65,7 +67,7 @@ def test_captures_of_every_kind_are_fitted(change, broken_capture, tmp_path):
 
 def test_start_from_the_visual_hull(small_capture, tmp_path):
     run = tmp_path / "run"
-    assert fit.main([str(small_capture), "--out", str(run), "--iterations", "6", "--domain", "hull", *QUICK]) == 0
+    assert fit.main([str(small_capture), "--out", str(run), "--iterations", "6", "--domain", "hull", *PLAIN]) == 0
     assert distance(run / "mesh.ply") < 0.04  # hardly a fit: it is the start that is near
     mesh = trimesh.load(run / "mesh.ply", process=False)
     assert mesh.is_watertight and mesh.euler_number == 2
@@ -100,7 +102,7 @@ def test_start_from_a_mesh(small_capture, tmp_path):
     trimesh.creation.torus(20, 8).apply_translation(CENTER).export(tmp_path / "torus.ply")
     run = tmp_path / "run"
     domain = ["--domain", "mesh", str(tmp_path / "torus.ply")]
-    assert fit.main([str(small_capture), "--out", str(run), "--iterations", "4", *domain, *QUICK]) == 0
+    assert fit.main([str(small_capture), "--out", str(run), "--iterations", "4", *domain, *PLAIN]) == 0
     assert trimesh.load(run / "mesh.ply", process=False).euler_number == 0
 
 
@@ -140,11 +142,11 @@ def test_without_masks_the_object_is_what_is_bright(broken_capture, tmp_path, ca
     path, _ = broken_capture
     no_masks(path)
     run = tmp_path / "run"
-    assert fit.main([str(path), "--out", str(run), "--iterations", "40", *QUICK]) == 0
+    assert fit.main([str(path), "--out", str(run), "--iterations", "24", *PLAIN]) == 0
     assert '"mask"' in (run / "log.jsonl").read_text() and distance(run / "mesh.ply") < 0.05
     with pytest.raises(InputError, match="--domain hull: there are no masks of the whole object"):
         fit.main([str(path), "--out", str(run), "--domain", "hull", "--masks", "given", *QUICK])
     for file in path.parent.glob("images/*.png"):
         mi.Bitmap(np.maximum(np.array(mi.Bitmap(str(file))), 90)).write(str(file))
-    assert fit.main([str(path), "--out", str(tmp_path / "bright"), "--iterations", "1", *SPHERE]) == 0
+    assert fit.main([str(path), "--out", str(tmp_path / "bright"), "--iterations", "1", *BRIEF]) == 0
     assert "the room was too bright to find masks" in capsys.readouterr().out
