@@ -22,7 +22,7 @@ from gradients import COVERAGE, HEIGHT, RADIANCE, STEPS, WIDTH, Picture, allowed
 mi.set_log_level(mi.LogLevel.Error)
 
 #: How many gradients and differences tell, and the differences' spp.
-NOISIEST, NOISY, QUIET, QUIETEST = (16, 4, 256), (8, 3, 192), (4, 3, 128), (2, 2, 64)
+NOISIEST, NOISY, QUIET, QUIETEST = (16, 4, 256), (8, 3, 192), (4, 3, 128), (2, 2, 32)
 CELLS = [  # moved, light, wall, shape, unit, channels, how many
     ("translate", "lamp", True, "bumpy", 1000.0, RADIANCE, QUIET),
     ("translate", "flash", False, "sphere", 1.0, COVERAGE, QUIET),
@@ -31,14 +31,14 @@ CELLS = [  # moved, light, wall, shape, unit, channels, how many
     ("camera moves", "flash", True, "bumpy", 1000.0, RADIANCE, NOISY),
     ("camera turns", "directional", True, "bumpy", 1.0, RADIANCE, NOISIEST),
     ("focal length", "lamp", True, "sphere", 1000.0, RADIANCE, QUIET),
-    ("light moves", "lamp", True, "bumpy", 1000.0, RADIANCE, QUIET),
-    ("light moves", "directional", True, "sphere", 1.0, RADIANCE, QUIET),
-    ("light moves", "flash", True, "bumpy", 1.0, RADIANCE, QUIET),
+    ("light moves", "lamp", True, "bumpy", 1000.0, RADIANCE, QUIETEST),
+    ("light moves", "directional", True, "sphere", 1.0, RADIANCE, QUIETEST),
+    ("light moves", "flash", True, "bumpy", 1.0, RADIANCE, QUIETEST),
     ("principal point", "lamp", False, "bumpy", 1.0, RADIANCE, QUIET),
-    ("distortion", "flash", False, "bumpy", 1.0, COVERAGE, NOISY),
-    ("falloff", "flash", False, "bumpy", 1000.0, RADIANCE, QUIET),
+    ("distortion", "flash", False, "bumpy", 1.0, COVERAGE, QUIET),
+    ("falloff", "flash", False, "bumpy", 1000.0, RADIANCE, QUIETEST),
     ("room", "flash", True, "bumpy", 1.0, RADIANCE, QUIETEST),
-    ("intensity", "flash", False, "sphere", 1.0, RADIANCE, QUIET),
+    ("intensity", "flash", False, "sphere", 1.0, RADIANCE, QUIETEST),
 ]
 
 
