@@ -136,8 +136,8 @@ def test_photometric_shows_it_on_the_object_alone_and_has_its_gradient():
     scene = load(LIGHTS, ball=ball, **emitters(room))
     dark = load(LIGHTS, ball=ball)
     photometric = mi.load_dict({"type": "photometric"})
-    image = mi.render(scene, sensor=1, integrator=photometric, spp=256, seed=2)
-    plain = np.array(mi.render(dark, sensor=1, integrator=photometric, spp=256, seed=2))
+    image = mi.render(scene, sensor=1, integrator=photometric, spp=64, seed=2)
+    plain = np.array(mi.render(dark, sensor=1, integrator=photometric, spp=64, seed=2))
     added = np.array(image)[..., :3] - plain[..., :3]
     assert (added[:8] == 0).all() and (added[:, :8] == 0).all()  # beside the object
     channels = indirect_light.render_indirect(
@@ -187,7 +187,7 @@ def test_least_squares_finds_the_room_among_wrong_pixels(frames):
     direct = torch.from_numpy(pictures(render_photographs(dark, photographs, 64, 0))).to(machine.device())
     room = RoomLight(torch.zeros(BASIS, 3), float(observed.mean()), frames).to(machine.device())
     surface = SimpleNamespace(scene=dark, table=None, unit=1.0)
-    for seed in range(8):
+    for seed in range(6):
         around = GlobalIllumination.of(surface, photographs, direct[..., 3], seed, 70, 64, rows=room.which)
         predicted = direct[..., :3] + around.interreflection
         lit_so_far = replace(photographs, room=room.harmonics.double().cpu().numpy())
