@@ -78,7 +78,7 @@ def test_a_short_fit_of_the_teapot_is_already_near_and_our_numbers_are_the_judge
     tree.write(folder / "scene.xml")
     fit.main([str(folder / "scene.xml"), "--out", str(out), "--iterations", "30", "--levels", "3", "--widths", "64",
               "--shares", "1", "--subdivisions", "4",
-              "--refine", "none"])  # fmt: skip
+              "--refine", "none", "--no-indirect", "--detail", "none"])  # fmt: skip
     ours = evaluation.evaluate(out, folder / "truth/mesh.ply", spp=1)
     # The start sphere is off by about 50 degrees; half a minute of one core gets this far.
     assert ours["normal_mean"] < 15 and ours["iou"] > 0.9
