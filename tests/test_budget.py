@@ -90,7 +90,8 @@ def test_an_iteration_is_timed_twice_on_the_same_photographs(small_capture, monk
     assert budget.measure(fit, [Stage(2, 28, 0, 1)], interrupted=lambda: len(seen) == 3) == {} and len(seen) == 3
 
 
-SMALL = ["--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2", "--domain", "sphere"]
+SMALL = ["--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2", "--domain", "sphere",
+         "--refine", "none", "--no-indirect", "--detail", "none", "--lobes", "1"]  # fmt: skip
 
 
 def test_a_fit_of_so_many_minutes_goes_on_as_one(small_capture, tmp_path, monkeypatch, capsys):

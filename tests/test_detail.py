@@ -458,7 +458,7 @@ def test_details_come_last_and_only_if_photographs_can_agree():
 
 
 SMALL = Config(iterations=24, levels=(2,), widths=(32,), shares=(1.0,), detail_share=0.5, batch=4, deterministic=True,
-               subdivisions=3, domain="sphere")  # fmt: skip
+               subdivisions=3, domain="sphere", refine=("none",), indirect=False, lobes="1")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
