@@ -620,7 +620,7 @@ def test_distortion_goes_where_the_lens_has_it(small_capture):
     fit, _ = posed(small_capture, refine=("distortion",), subdivisions=3)
     with torch.no_grad():
         fit.model.calibration.distortion.fill_(1)  # 0.05: a tenth of a pixel where the object ends
-    for _ in range(60):
+    for _ in range(45):
         fit.step()
     found = [shot.camera.distortion for shot in fit.calibrated().shots]
     assert np.abs(found).max() < 0.3 * 0.05
