@@ -20,7 +20,7 @@ from mi_ring.rendering import bridge
 from mi_ring.system import machine
 
 TINY = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--batch", "2", "--subdivisions", "2",
-        "--domain", "sphere"]  # fmt: skip
+        "--domain", "sphere", "--refine", "none", "--no-indirect", "--detail", "none"]  # fmt: skip
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU and a torch built with CUDA")
 
 

@@ -11,7 +11,8 @@ from mi_ring import convert, export, fit
 from mi_ring.errors import InputError
 from mi_ring.system import optional
 
-QUICK = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2"]
+QUICK = ["--iterations", "1", "--levels", "2", "--widths", "28", "--shares", "1", "--subdivisions", "2",
+         "--refine", "none", "--no-indirect"]  # fmt: skip
 CODE = """
 import sys
 sys.modules.update(dict.fromkeys("gpytoolbox xatlas pycolmap".split()))  # as if they were not installed
