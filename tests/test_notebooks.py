@@ -19,9 +19,11 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 #: What takes the place of each notebook's own parameters. View 2 of these is photograph 016.
-SMALL = ["--iterations", "4", "--levels", "3", "--widths", "32", "--shares", "1", "--subdivisions", "3"]
-SMALL_SETTINGS = {"iterations": 4, "levels": (3,), "widths": (32,), "shares": (1.0,), "subdivisions": 3}
-OWN = {"domain": "sphere", "shadows": False, "indirect": False}  #: those of notebook 5
+SMALL = ["--iterations", "4", "--levels", "3", "--widths", "32", "--shares", "1", "--subdivisions", "3",
+         "--refine", "none", "--no-indirect"]  # fmt: skip
+SMALL_SETTINGS = {"iterations": 4, "levels": (3,), "widths": (32,), "shares": (1.0,), "subdivisions": 3,
+                  "refine": ("none",), "indirect": False}  # fmt: skip
+OWN = {"domain": "sphere", "shadows": False}  #: those of notebook 5
 QUICK = {
     "1_first_fit": {"options": SMALL, "view": 2, "spp": 4},
     "2_plugins": {"size": 40, "spp": 4},
