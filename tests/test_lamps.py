@@ -27,7 +27,7 @@ LAMPS = [
     Light("directional", np.array([0.48, -0.6, -0.64]), np.array([1.5, 0.7, 1.1])),
 ]
 TINY = {
-    "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 30, "subdivisions": 3, "domain": "sphere",
+    "levels": (3,), "widths": (32,), "shares": (1.0,), "iterations": 40, "subdivisions": 3, "domain": "sphere",
     "indirect": False,  # of a convex object there is none
 }  # fmt: skip
 
