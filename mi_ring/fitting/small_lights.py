@@ -6,6 +6,7 @@ method is orthogonal matching pursuit ("Orthogonal Matching Pursuit", Pati, Reza
 candidate is taken that reduces the squared error most, after all strengths are solved for again.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,10 +32,12 @@ GRID = 600  #: directions all around, about 8° apart
 FIRST_SHARPNESS = 40.0  #: of the lobes in all directions: as wide as they are apart
 SHARPER = (6.0, 20.0, 60.0, 200.0, 700.0)  #: sharpness that is tried about a direction
 RINGS = (6.0, 3.0, 1.5)  #: steps by which a direction is refined [degrees]
-#: A lobe is added if it explains at least this share of the squared error that is left. The first must explain more:
-#: it was 0.22 to 0.26 for the sun and for windows, up to 0.1 under an overcast sky, of a surface that is still coarse.
-FIRST, ADDED = 0.15, 0.05
-KEPT = 0.01  #: a lobe is removed if it explains less than this share
+#: A lobe is added if it explains at least this share of the squared error that is left, and kept if it explains the
+#: second share.
+ADDED, KEPT = 0.05, 0.01
+#: The first lobe must also give this share of all light. While the surface is coarse, a faint lobe explains its errors:
+#: it gave 0.05 under an overcast sky; the sun and windows gave 0.2 and more.
+FIRST = 0.1
 APART = 0.5  #: distance of lobes, relative to the sum of their widths, below which two are one
 
 
@@ -162,12 +165,22 @@ class LobeSearch:
         gains, left = self.gains(self.candidates(toward, np.full(GRID, FIRST_SHARPNESS)))
         best = int(gains.argmax())
         lobe, gain, _ = self.refined(toward[best], FIRST_SHARPNESS)
-        enough = ADDED if self.lobes else FIRST
-        if not gain >= enough * left or any(are_one(lobe, other) for other in self.lobes):
+        if not gain >= ADDED * left or any(are_one(lobe, other) for other in self.lobes):
             return False
         self.lobes.append(lobe)
         self.pictures.append(self.picture(*lobe))
-        return True
+        if len(self.lobes) > 1 or self.share() >= FIRST:
+            return True
+        self.lobes, self.pictures = [], []
+        return False
+
+    def share(self) -> float:
+        """Compute the share of the lobes in all light: of their mean radiance over all directions."""
+        found = self.found()
+        if found.lobes is None:
+            return 0.0
+        lobes, smooth = found.lobes.mean_radiance().mean(), float(found.harmonics[0].mean()) / math.sqrt(4 * math.pi)
+        return float(lobes / (lobes + max(smooth, 0.0)))
 
     def refined(
         self, toward: np.ndarray, sharpness: float, without: int | None = None
