@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from accuracy import processor, product_speed, table
 
-from mi_ring.fitting.small_lights import fibonacci
+from mi_ring.geometry.sphere_map import even_directions
 from mi_ring.images import read_image, write_image
 from mi_ring.rendering.spherical_harmonics import envmap_directions, room_envmap
 
@@ -76,7 +76,7 @@ def whole(radiance: np.ndarray) -> np.ndarray:
 def brightest(radiance: np.ndarray) -> np.ndarray:
     """(3,) the direction in which a map, blurred by about 10 degrees, is brightest."""
     away, weight = envmap_directions(len(radiance))
-    grey, candidates = weight * radiance.mean(-1).ravel(), fibonacci(CANDIDATES)
+    grey, candidates = weight * radiance.mean(-1).ravel(), even_directions(CANDIDATES)
     blurred = [np.exp(BLUR * (some @ away.T - 1)) @ grey for some in np.array_split(candidates, 50)]
     return candidates[np.concatenate(blurred).argmax()]
 

@@ -18,8 +18,9 @@ from mi_ring import synthesize
 from mi_ring.calibration.room_light import LOBE_RIDGE, RIDGE, RoomLight
 from mi_ring.capture.emitter_elements import room_elements
 from mi_ring.capture.scenefile import scene_bytes
-from mi_ring.fitting import schedule
+from mi_ring.fitting import schedule, small_lights
 from mi_ring.fitting.lighting import Lighting
+from mi_ring.fitting.refinement import finds_small_lights
 from mi_ring.fitting.small_lights import find_lobes
 from mi_ring.images import write_image
 from mi_ring.plugins.matte_reflection import softened_cosine, zonal_coefficients
@@ -252,6 +253,10 @@ def test_fluxes_are_not_negative():
     np.testing.assert_allclose(np.append(harmonics[:, 1], flux[0, 1]), expected, rtol=1e-5)
 
 
+LAMP = 60 * 2 * np.pi * (1 - np.cos(np.radians(5)))  #: flux of the lamp of `in_the_sun`, in light of 0.3
+SHARE = LAMP / (LAMP + 0.3 * 4 * np.pi)
+
+
 @pytest.fixture(scope="module")
 def in_the_sun(tmp_path_factory):
     """Path of a scene of a glossy ball in grey light with a small lamp toward `TOWARD`, of which it says nothing."""
@@ -268,7 +273,7 @@ def in_the_sun(tmp_path_factory):
     return folder / "capture/scene.xml"
 
 
-def test_a_search_finds_a_small_light_and_none_in_smooth_light(in_the_sun, in_an_environment):
+def test_a_search_finds_a_small_light_and_none_in_smooth_light(in_the_sun, in_an_environment, monkeypatch):
     """On the surface from which a fit starts, with the highlights of the ball, or without them."""
     for path, lamps in ((in_the_sun, 1), (in_an_environment, 0)):
         config = mi_ring.Config.preset("fast", **TINY, light="environment")
@@ -290,6 +295,11 @@ def test_a_search_finds_a_small_light_and_none_in_smooth_light(in_the_sun, in_an
         if found is not None:
             assert np.degrees(np.arccos(found.toward[0] @ TOWARD)) < 4
             assert (found.flux > 0).all() and found.sharpness[0] > 20
+            search = small_lights.LobeSearch(fit.problem, fit.model, fit.renderer.show(fit.model, 3), 5)
+            assert search.add() and search.share() == pytest.approx(SHARE, abs=0.1)
+            with monkeypatch.context() as patch:
+                patch.setattr(small_lights, "FIRST", 0.5)  # a fainter one is not believed
+                assert find_lobes(fit.problem, fit.model, fit.renderer, 3, 5).lobes is None
 
 
 def test_a_fit_moves_lobes_continues_with_them_and_writes_them(in_the_sun, tmp_path, monkeypatch):
@@ -310,6 +320,12 @@ def test_a_fit_moves_lobes_continues_with_them_and_writes_them(in_the_sun, tmp_p
     read = mi_ring.load_capture(tmp_path / "scene.xml", images=False)
     np.testing.assert_allclose(read.lobes.values(), found.values(), rtol=1e-4, atol=1e-6)
     assert "brightest light" in (tmp_path / "report.html").read_text()
+
+
+def test_none_are_sought_beside_a_flash_and_by_the_papers_method(small_capture):
+    config = mi_ring.Config.preset("fast", **TINY)
+    assert config.small_lights and not mi_ring.Config.preset("paper").small_lights
+    assert not finds_small_lights(mi_ring.Fit(mi_ring.load_capture(small_capture), config).model.calibration, config)
 
 
 def test_lobes_beside_a_flash_stay_as_given():

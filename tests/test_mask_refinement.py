@@ -14,7 +14,7 @@ from mi_ring.fitting import fit as fitting
 from mi_ring.fitting import mask_refinement
 
 WITHOUT = [1, 4, 5, 10]  #: photographs whose masks are taken away
-BRIEF = {
+SHORT = {
     "iterations": 24, "levels": (3,), "widths": (56,), "shares": (1,), "subdivisions": 3, "indirect": False,
     "detail": "none",
 }  # fmt: skip
@@ -62,7 +62,7 @@ def without_some_masks(small_capture, tmp_path):
 def test_masks_that_are_missing_are_found_about_the_surface_and_written(without_some_masks, tmp_path):
     scene, true = without_some_masks
     capture = mi_ring.load_capture(scene)
-    fit = Fit(capture, Config(**BRIEF, refine=("masks",)))
+    fit = Fit(capture, Config(**SHORT, refine=("masks",)))
     for it in fit:
         masked = sum(mask is not None for mask in fit.capture.masks)
         assert masked == (12 if it.number > 12 else 12 - len(WITHOUT))
@@ -83,7 +83,7 @@ def test_masks_that_are_missing_are_found_about_the_surface_and_written(without_
 
 def test_what_the_second_search_is_not_sure_of_stays(without_some_masks, monkeypatch):
     scene, _ = without_some_masks
-    fit = Fit(mi_ring.load_capture(scene), Config(**BRIEF, refine=("masks",)))
+    fit = Fit(mi_ring.load_capture(scene), Config(**SHORT, refine=("masks",)))
     half = {k: torch.ones(40, 56, dtype=torch.uint8) for k in range(12)}
     searches = iter([half, {k: 0 * mask for k, mask in half.items() if k != 4}])
     monkeypatch.setattr(fitting, "find_masks", lambda *parts: next(searches))
@@ -111,7 +111,7 @@ def test_outlines_of_reduced_pictures_stay_where_they_are(small_capture):
 def test_masks_that_do_not_go_with_the_surface_are_not_taken(without_some_masks, monkeypatch):
     scene, _ = without_some_masks
     capture = mi_ring.load_capture(scene)
-    fit = Fit(capture, Config(**BRIEF, refine=("masks",)))
+    fit = Fit(capture, Config(**SHORT, refine=("masks",)))
     monkeypatch.setattr(
         mask_refinement, "grabcut", lambda picture, coverage, background, band: coverage * (np.arange(56) > 27)
     )
@@ -126,4 +126,4 @@ def test_masks_of_a_dark_room_are_left_alone(small_capture):
     capture = mi_ring.load_capture(small_capture, masks="none")
     assert capture.threshold is not None
     with pytest.raises(InputError, match="--refine masks: .* by brightness"):
-        Fit(capture, Config(**BRIEF, refine=("masks", "light")))
+        Fit(capture, Config(**SHORT, refine=("masks", "light")))

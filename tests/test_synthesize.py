@@ -17,8 +17,8 @@ import mi_ring
 from mi_ring import check, synthesize
 from mi_ring.capture.decoding import decode
 from mi_ring.errors import InputError
-from mi_ring.fitting.small_lights import fibonacci
 from mi_ring.geometry.camera import Camera
+from mi_ring.geometry.sphere_map import even_directions
 from mi_ring.images import read_image
 from mi_ring.metrics.surfaces import compare_surfaces, load_true_mesh
 from mi_ring.photogrammetry.marker_sheet import MarkerSheet
@@ -136,7 +136,7 @@ def test_a_sphere_in_a_room_is_as_bright_as_it_must_be(kind, in_camera):
     harmonics = np.vstack([room[:1], room[PER_FRAME : PER_FRAME + 8]]) if in_camera else room[:9]
     irradiance = (np.array(basis).T @ (order[:, None] * harmonics)).reshape(*hit.shape, 3)
     if windows is not None:
-        toward = fibonacci(20_000)
+        toward = even_directions(20_000)
         radiance = windows.radiance(toward, camera.to_world) * 4 * np.pi / len(toward)
         irradiance += np.maximum(n @ toward.T, 0) @ radiance
         assert np.linalg.norm(windows.mean_radiance()) > 1.3 * np.linalg.norm(harmonics[0]) / np.sqrt(4 * np.pi)
@@ -216,8 +216,9 @@ def test_photographs_without_a_light_of_their_own_show_the_room_alone(lump, tmp_
     size = ["--views", "2", "--size", "28", "20", "--spp", "9", "--novel", "0", "--cameras", "turntable"]
     room = ["--room", "1", "--room-kind", "windows"]
     synthesize.main([str(lump), str(tmp_path / "pair"), *size, *room, "--pairs", "--exposure", "0.5"])
-    exposure = ["--exposure", str(0.5 * np.pi)]  # of a surface in a room, instead of one that a flash lights
-    synthesize.main([str(lump), str(tmp_path / "dark"), *size, *room, "--light", "none", "--wrong-room", *exposure])
+    synthesize.main([
+        str(lump), str(tmp_path / "dark"), *size, *room, "--light", "none", "--wrong-room", "--exposure", "0.5",
+    ])  # fmt: skip
     for k in range(2):
         np.testing.assert_array_equal(*(read_image(tmp_path / folder / f"{k:03}.exr")
                                         for folder in ("pair/ambient", "dark/images")))  # fmt: skip
@@ -451,6 +452,9 @@ def test_colours_of_a_file_are_those_of_the_object(tmp_path):
     (["--light", "lamp", "--lamps", "9"], "--lamps: is 9, must be 1 to 8"),
     (["--cameras", "turntable", "--light", "lamp"], "--cameras: is turntable; an --environment"),
     (["--light", "none"], "--light: is none; give --room 1"),
+    (["--light", "none", "--room", "1", "--wrong-power", "5"], "--light: is none; leave out .*--wrong-power"),
+    (["--room-kind", "windows"], "--room-kind: there is no room; give --room"),
+    (["--room-kind", "windows", "--room", "1", "--table", "plain"], "--room-kind: is windows, .* leave out --table"),
     (["--light", "moon"], "--light: is moon; must be one of"),
 ])  # fmt: skip
 def test_mistakes_are_told_in_one_line_before_any_work(options, message, lump, tmp_path):

@@ -124,8 +124,8 @@ def places(view):
     return cx - fx * left / forward, cy - fy * up / forward
 
 
-def horizon(view):
-    """Which of the ball's vertices face the camera enough, and which are not at the horizon itself."""
+def edge(view):
+    """Which of the ball's vertices face the camera enough, and which are not at the edge itself."""
     return slant(view) > LEAST, np.abs(slant(view) - LEAST) > 1e-3
 
 
@@ -139,7 +139,7 @@ def unseen_share(radius):
 def test_what_the_frame_cuts_off_is_not_seen(seed):
     """5 × 7 pixels; they begin at the optical axis and cut off the top."""
     seen_by = view(seed, focal=(6.0, 9.0), centre=(0.0, 3.0), size=(5, 7))
-    (x, y), (facing, clear) = places(seen_by), horizon(seen_by)
+    (x, y), (facing, clear) = places(seen_by), edge(seen_by)
     inside = (x >= 0) & (x < 5) & (y >= 0) & (y < 7)
     assert (facing & (x < 0)).sum() > 500 and (facing & (y < 0)).sum() > 50
     seen = Visibility(*ball(), [seen_by]).of_vertices()
@@ -150,7 +150,7 @@ def test_pixels_that_show_nothing_do_not_show_it():
     valid = np.full((75, 70), 255, np.uint8)
     valid[:, :29], valid[50:, :], valid[44, 33], valid[20:25, 40:] = 0, 127, 0, 128
     seen_by = view(9, valid=valid)
-    (x, y), (facing, clear) = places(seen_by), horizon(seen_by)
+    (x, y), (facing, clear) = places(seen_by), edge(seen_by)
     hidden = (x < 29) | (y >= 50) | ((x >= 33) & (x < 34) & (y >= 44) & (y < 45))
     assert (facing & hidden).sum() > 500
     seen = Visibility(*ball(), [seen_by]).of_vertices()
@@ -208,7 +208,7 @@ def longer(view):
 
 
 def expected(ring, s, view):
-    """Which points of the ball the camera sees, and which are far enough from the horizon to say."""
+    """Which points of the ball the camera sees, and which are far enough from the edge to say."""
     points = ring.surface(torch.as_tensor(s)).detach().numpy()
     away = view.camera.position - points
     away, normals = away / np.linalg.norm(away, axis=1, keepdims=True), (points - CENTER) / RADIUS

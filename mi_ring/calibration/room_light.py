@@ -139,15 +139,14 @@ class RoomLight(nn.Module):
         room without other light has its finest harmonics only later in the fit. `total`: returns the sum of a tensor
         over all processes; default: one process.
         """
-
         which = [k for k in around.rows if k < len(self.vector[0])]  # without lobes beside a flash
-        equations = total(torch.cat(self.equations(around, len(which), predicted, observed, counted), 1))
-        if not bool(equations.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
+        sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted), 1))
+        if not bool(sums.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
             return
         self.matrix *= MEMORY
         self.vector *= MEMORY
         self.shown *= MEMORY
-        matrix, vector, shown = equations.split([len(which) ** 2, len(which), len(which) + 1], 1)
+        matrix, vector, shown = sums.split([len(which) ** 2, len(which), len(which) + 1], 1)
         self.matrix[:, torch.tensor(which)[:, None], which] += matrix.unflatten(1, (len(which), -1))
         self.vector[:, which] += vector
         self.shown[:, [*which, -1]] += shown
@@ -158,7 +157,8 @@ class RoomLight(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Compute the normal equations of photographs for J = `count` strengths, the first of `around`.
 
-        Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The rest is as in `solve`.
+        Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The other arguments are
+        those of `solve`.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:
@@ -189,7 +189,7 @@ class RoomLight(nn.Module):
         return matrix.flatten(1), vector, shown
 
     def update(self, progress: float) -> None:
-        """Set the light to the solution of the normal equations. Does nothing before they tell each harmonic."""
+        """Set the light to the solution of the normal equations. Does nothing while they do not tell each harmonic."""
         told = self.matrix.diagonal(dim1=1, dim2=2)[:, self.used].mean(1)
         if not bool((told > 0).all()):
             return

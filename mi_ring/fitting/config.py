@@ -117,7 +117,7 @@ class Tuning:
     mesh skips two thirds of the iterations of the first stage. It adds 40 % of the skipped iterations to the second."""
     small_lights: int = 8
     """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
-    Only if the room is the only light. The fit adds those that photographs show. 0: none are sought."""
+    Beside a flash or other lights none are sought, whatever the number. 0: none are sought."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
     A fit with --detail chooses the level itself, 7 or 8 for most captures.

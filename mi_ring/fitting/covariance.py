@@ -80,12 +80,13 @@ def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
     Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown. The room's light is
     "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. All fitted photographs are rendered.
-    `level`: level of the mesh of the results; a coarser one is rendered if it is fine. Colours and silhouettes
-    eliminate the surface separately, so its prior counts twice.
+    `level`: level of the mesh of the results; at most `LEVEL` is rendered. Colours and silhouettes eliminate the
+    surface separately, so its prior counts twice.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None
-    layout, level = Layout(calibration), min(level, LEVEL)
+    layout = Layout(calibration)
+    level = min(level, LEVEL)
     surface = renderer.show(model, level)
     patches = Patches(surface, ring.domain.sample(level)[0], float(ring.radius), ring.brdf_net.bsdf_parameters)
     colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))

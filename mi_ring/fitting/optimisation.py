@@ -196,6 +196,8 @@ class Optimisation:
         if schedule.lights_due(iteration):
             level = schedule.stage(iteration).level
             found = problem.processes.on_first(lambda: find_lobes(problem, self.model, renderer, level, iteration))
+            if found is None:
+                return
             found.put_into(calibration.room)
             for optimizer in self.optimizers:
                 for parameter in (calibration.room.toward, calibration.room.log_sharpness):

@@ -19,6 +19,7 @@ from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.geometry.hull import evenly_spaced
+from mi_ring.geometry.sphere_map import even_directions
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.lobe_candidates import candidate_pictures
 from mi_ring.rendering.photographs import Photographs
@@ -59,12 +60,15 @@ class FoundLobes:
         room.vector.copy_(self.vector)
 
 
-def find_lobes(problem: Problem, model: Model, renderer: Renderer, level: int, iteration: int) -> FoundLobes:
+def find_lobes(problem: Problem, model: Model, renderer: Renderer, level: int, iteration: int) -> FoundLobes | None:
     """Find the lobes of the room's light, beginning with those that are known. Renders the surface.
 
+    Returns None if no pixel can be compared: the surface is not where the masks are, or all pixels are clipped.
     `level`: level of the mesh that is rendered. `iteration`: number of the iteration, for random numbers.
     """
     search = LobeSearch(problem, model, renderer.show(model, level), iteration)
+    if not len(search.target):
+        return None
     search.refine()
     while len(search.lobes) < problem.config.small_lights and search.add():
         search.refine()
@@ -97,7 +101,7 @@ class LobeSearch:
         """Render harmonics at random pixels of the object. Returns (their pictures (n, J, 3), photographs (n, 3))."""
         capture, random = problem.capture, np.random.default_rng(self.seed)
         fitted = problem.fitted[evenly_spaced(len(problem.fitted), PHOTOGRAPHS)]
-        basis, observed = [], []
+        basis, observed = [torch.zeros(0, len(self.room.free), 3)], [torch.zeros(0, 3)]
         for index in capture.together(fitted):
             scale = -(-max(capture.shots[index[0]].size) // SEARCH_WIDTH)
             photographs = calibration.refined_photographs(
@@ -115,7 +119,7 @@ class LobeSearch:
                 continue
             self.parts.append((photographs, pixels))
             chosen = torch.from_numpy(pixels.astype(np.int64))
-            basis.append(around.transfer.flatten(1, 3).cpu()[:, chosen].movedim(0, 1))
+            basis.append(around.transfer.flatten(1, 3).cpu()[:, chosen].movedim(0, 1).nan_to_num())
             linear = calibration.linear(seen.rgb, index, scale)
             observed.append(linear.reshape(-1, 3)[chosen])
         return torch.cat(basis), torch.cat(observed)
@@ -124,7 +128,8 @@ class LobeSearch:
         """Render the pictures (n, D, 3) of lobes, weighted like the photographs."""
         parts = [candidate_pictures(self.surface, photographs, pixels, toward, sharpness, self.in_camera, self.seed)
                  for photographs, pixels in self.parts]  # fmt: skip
-        return torch.from_numpy(np.concatenate(parts)) * self.weights[:, None, None]
+        parts.append(np.zeros((0, len(toward), 3), np.float32))
+        return torch.from_numpy(np.concatenate(parts)).nan_to_num() * self.weights[:, None, None]
 
     def picture(self, toward: np.ndarray, sharpness: float) -> Tensor:
         """Render the picture (n, 3) of one lobe, weighted like the photographs."""
@@ -160,8 +165,11 @@ class LobeSearch:
         return torch.cat([basis, ridge])
 
     def add(self) -> bool:
-        """Add the lobe that explains most of the error that is left. Returns False if none explains enough."""
-        toward = fibonacci(GRID)
+        """Add the lobe that explains most of the error that is left.
+
+        Returns False if none explains enough, or if the first gives less than `FIRST` of the light.
+        """
+        toward = even_directions(GRID)
         gains, left = self.gains(self.candidates(toward, np.full(GRID, FIRST_SHARPNESS)))
         best = int(gains.argmax())
         lobe, gain, _ = self.refined(toward[best], FIRST_SHARPNESS)
@@ -180,7 +188,7 @@ class LobeSearch:
         if found.lobes is None:
             return 0.0
         lobes, smooth = found.lobes.mean_radiance().mean(), float(found.harmonics[0].mean()) / math.sqrt(4 * math.pi)
-        return float(lobes / (lobes + max(smooth, 0.0)))
+        return float(lobes / max(lobes + max(smooth, 0.0), 1e-30))
 
     def refined(
         self, toward: np.ndarray, sharpness: float, without: int | None = None
@@ -248,13 +256,6 @@ def are_one(lobe: tuple[np.ndarray, float], other: tuple[np.ndarray, float]) -> 
     """Test whether two lobes (direction, sharpness) are too near to each other to be told apart."""
     angle = np.arccos(np.clip(lobe[0] @ other[0], -1, 1))
     return bool(angle < APART * (lobe[1] ** -0.5 + other[1] ** -0.5))
-
-
-def fibonacci(count: int) -> np.ndarray:
-    """Return `count` unit vectors (count, 3), evenly spaced."""
-    k = np.arange(count) + 0.5
-    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
-    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1)
 
 
 def tilted(direction: np.ndarray, angle: float) -> np.ndarray:

@@ -62,3 +62,10 @@ def sphere_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
         x = splu((mass + STEP * laplacian).tocsc()).solve(mass @ x)
         x = x - mass.diagonal() @ x / mass.diagonal().sum()
     return normalized(x)
+
+
+def even_directions(count: int) -> np.ndarray:
+    """Return `count` unit vectors (count, 3), evenly spaced: a Fibonacci lattice."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1)

@@ -18,7 +18,7 @@ def render_indirect(scene, photographs, spp, seed, bounces=BOUNCES, rows=(), tab
     longer paths are missing. `spp`: paths per pixel. `table`: a scene of tables, which paths can hit after their first
     point; it casts no shadows. None: no table.
 
-    `rows`: n indices of spherical harmonics; indices from BASIS on are those of all lobes of `photographs`. For
+    `rows`: n rows of `Photographs.room_strengths`: harmonics, and from BASIS on all lobes of `photographs`. For
     these, 6 n more Floats follow. The first 3 n are R, G, B of the radiance transfer of each harmonic: the radiance of
     the surface in a room whose radiance is this harmonic, with shadows and interreflection; for a lobe, its flux is 1.
     The last 3 n are the same without interreflection, those of harmonics also without shadows and without noise.

@@ -29,8 +29,8 @@ class MaskedCamera(NamedTuple):
 class Visibility:
     """Tests which points of a mesh are seen by at least one of the cameras `views`.
 
-    A camera sees a point if the point faces the camera, by at least 12 degrees to the surface (`GRAZING`), projects to
-    a valid pixel, and is not hidden by the mesh.
+    A camera sees a point if its line of sight meets the front of the surface at about 12 degrees or more (`GRAZING`),
+    if the point projects to a valid pixel, and if the mesh does not hide it.
     `vertices` (V, 3) [scene units], `faces` (F, 3): the mesh.
     """
 

@@ -14,10 +14,10 @@ RoomKind = Literal["constant", "harmonics", "windows"]
 
 LOW_ORDERS = 9  #: number of spherical harmonics of orders 0 to 2, which a room has
 TINT, CONTRAST = 0.12, 0.5  #: of a room's light: variation of the colours, standard deviation of each harmonic
-CANDIDATES = 4  #: random directions for a further lamp; the one farthest from the other lamps is taken
-WEAKEST = 0.4  #: least intensity of a further lamp [intensity of the first lamp]
+CANDIDATES = 4  #: random directions for a further lamp or window; the one farthest from the others is taken
+WEAKEST = 0.4  #: least intensity of a further lamp or window [largest intensity]
 DARKEST = 0.15  #: least radiance of a room in any direction [its mean radiance]
-WINDOWS, OF_WINDOWS = 3, 0.6  #: in a room of this kind, and their share of its light
+WINDOWS, WINDOWS_SHARE = 3, 0.6  #: in a room of this kind, and their share of its light
 SHARPNESS = 20.0, 300.0  #: of a window, between which its logarithm is drawn
 
 
@@ -55,15 +55,20 @@ def further_lamps(count: int, first: Light, random: np.random.Generator) -> list
 
     Their directions are random and far apart. They are weaker than `first` and have other colours.
     """
-    distance, directions = np.linalg.norm(first.vector), [first.vector / np.linalg.norm(first.vector)]
-    lights = []
+    distance = np.linalg.norm(first.vector)
+    directions, lights = first.vector[None] / distance, []
     for _ in range(count):
-        candidates = random.normal(size=(CANDIDATES, 3))
-        candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
-        directions.append(candidates[(candidates @ np.transpose(directions)).max(1).argmin()])
+        directions = with_another(directions, random)
         strength = random.uniform(WEAKEST, 1) * (1 + TINT * random.uniform(-1, 1, 3))
         lights.append(Light("point", distance * directions[-1], first.rgb * strength))
     return lights
+
+
+def with_another(directions: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Add a random direction, far from the others, to unit vectors (n, 3). Returns (n + 1, 3)."""
+    candidates = random.normal(size=(CANDIDATES, 3))
+    candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
+    return np.vstack([directions, candidates[(candidates @ directions.T).max(1).argmin()]])
 
 
 def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
@@ -82,9 +87,9 @@ def rotate_randomly(position: np.ndarray, spread: float, random: np.random.Gener
 def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) -> tuple[np.ndarray, Lobes | None]:
     """Draw the light of a random room. Returns spherical harmonics (BASIS, 3) of its RGB radiance, and small lights.
 
-    The mean radiance is about 1. `kind`: "constant": the same radiance from all directions; "harmonics": it varies with
-    the direction; "windows": so does it, and there are small lights. `in_camera`: True: the light is fixed to the
-    camera; False: it is fixed in the world.
+    Without small lights the latter is None. The mean radiance is about 1. `kind`: "constant": the same radiance from
+    all directions; "harmonics": it varies with the direction; "windows": like "harmonics", but most of the light comes
+    from small lights. `in_camera`: True: the light is fixed to the camera; False: it is fixed in the world.
     """
     colour = 1 + TINT * random.uniform(-1, 1, 3)
     room = np.zeros((BASIS, 3))
@@ -96,19 +101,20 @@ def random_room(kind: RoomKind, in_camera: bool, random: np.random.Generator) ->
         room[first : first + LOW_ORDERS - 1] = waves * min(1.0, (1 - DARKEST) / -darkest)
     if kind != "windows":
         return room, None
-    return (1 - OF_WINDOWS) * room, random_windows(in_camera, random)
+    return (1 - WINDOWS_SHARE) * room, random_windows(in_camera, random)
 
 
 def random_windows(in_camera: bool, random: np.random.Generator) -> Lobes:
-    """Draw `WINDOWS` small lights, of different directions, widths and colours. Their mean radiance is `OF_WINDOWS`."""
-    toward = random.normal(size=(1, 3))
+    """Draw `WINDOWS` small lights of different directions, widths and colours.
+
+    Their mean radiance is `WINDOWS_SHARE`. `in_camera`: as in `random_room`.
+    """
+    first = random.normal(size=(1, 3))
+    toward = first / np.linalg.norm(first)
     while len(toward) < WINDOWS:
-        candidates = random.normal(size=(CANDIDATES, 3))
-        candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
-        toward = np.vstack([toward, candidates[(candidates @ toward.T).max(1).argmin()]])
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        toward = with_another(toward, random)
     least, most = np.log(SHARPNESS)
     sharpness = np.exp(random.uniform(least, most, WINDOWS))
     flux = random.uniform(WEAKEST, 1, (WINDOWS, 1)) * (1 + TINT * random.uniform(-1, 1, (WINDOWS, 3)))
-    flux *= OF_WINDOWS * 4 * np.pi / flux.mean(1).sum()
+    flux *= WINDOWS_SHARE * 4 * np.pi / flux.mean(1).sum()
     return Lobes(toward, sharpness, flux, np.full(WINDOWS, in_camera))

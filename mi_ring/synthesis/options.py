@@ -101,7 +101,7 @@ class SynthesizeConfig:
     room_kind: RoomKind = "constant"
     """How the light of --room depends on the direction.
     constant: the same from all sides. harmonics: stronger from some sides, by spherical harmonics of order 2.
-    windows: like harmonics, and three small bright lights."""
+    windows: like harmonics, but most of it comes from three small lights."""
     pairs: bool = False
     """Render each view a second time, under the light of --room alone. The scene file names these second photographs as
     `ambient`. A fit subtracts them from the others."""
@@ -198,6 +198,12 @@ def require_options(config: SynthesizeConfig) -> None:
                          "--room 0.2 --room-kind windows, which stands still like the camera")  # fmt: skip
     if config.light == "none" and (not config.room or config.environment or config.pairs):
         raise InputError("--light: is none; give --room 1, and neither --environment nor --pairs")
+    if config.light == "none" and (config.wrong_light or config.wrong_power or any(config.offset)):
+        raise InputError("--light: is none; leave out --offset, --wrong-light and --wrong-power")
+    if config.room_kind == "windows" and not config.room:
+        raise InputError("--room-kind: there is no room; give --room, for instance 0.2")
+    if config.room_kind == "windows" and config.table != "none":
+        raise InputError("--room-kind: is windows, which may be below the table; leave out --table")
     if config.distance is not None and not 1.05 <= config.distance <= 1000:
         raise InputError(f"--distance: is {config.distance}, must be 1.05 to 1000 radii of the object")
     if config.pattern != "stripes" and not config.second:

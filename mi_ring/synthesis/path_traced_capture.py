@@ -159,7 +159,7 @@ class Studio:
         number. `scale`: factor by which width and height of the picture are divided.
         """
         depth, view = self.config.depth, LensCamera(taken.camera.shrunk(scale))
-        if self.environment is None and not self.lit:
+        if self.config.light == "none":
             return np.zeros((*reversed(view.camera.size), 3))
         light = taken.light if self.environment is None else load_element(self.environment)
         picture = scene.radiance(view, light, spp, taken.seed, depth, hidden=self.environment is None)
@@ -188,7 +188,7 @@ class Studio:
         """
         config = self.config
         if config.exposure is not None:
-            return config.exposure * (np.pi if self.lit else 1.0)
+            return config.exposure * (1.0 if self.environment is not None else np.pi)
         values, scale = [], max(1, min(TRIAL_SCALE, min(config.size) // 8))
         for photograph in photographs[:: -(-len(photographs) // TRIALS)]:
             inside = scene.coverage(LensCamera(photograph.camera.shrunk(scale)), 16) > 0.9
