@@ -68,7 +68,8 @@ def test_exposures_are_found_where_the_light_is_unknown(in_an_environment, tmp_p
         write_image((read_image(path) * true[k]).astype(np.float32), path)
     text = (exposed / "scene.xml").read_text()
     capture = mi_ring.load_capture(exposed / "scene.xml")
-    config = mi_ring.Config.preset("fast", **TINY | {"iterations": 50}, light="environment", refine=("gain",))
+    changes = TINY | {"iterations": 50, "light": "environment", "small_lights": 0, "refine": ("gain",)}
+    config = mi_ring.Config.preset("fast", **changes)
     fit = mi_ring.Fit(capture, config, lighting=Lighting("environment"))
     for _ in fit:
         pass
@@ -257,7 +258,7 @@ def test_light_and_material_settle_where_the_surface_is(in_an_environment):
         return vertices, float((material["diffuse"].std(0) / material["diffuse"].mean(0)).mean())
 
     capture = mi_ring.load_capture(in_an_environment)
-    config = mi_ring.Config.preset("fast", **TINY, light="environment")
+    config = mi_ring.Config.preset("fast", **TINY, light="environment", small_lights=0)
     lighting = Lighting("environment", one_material_until=0.01)  # of one material, but not for long
     fit = mi_ring.Fit(capture, config, lighting=lighting)
     *_, shaping, settling = fit.schedule.stages
