@@ -21,7 +21,6 @@ from mi_ring.capture.scenefile import scene_bytes
 from mi_ring.fitting import schedule, small_lights
 from mi_ring.fitting.lighting import Lighting
 from mi_ring.fitting.refinement import finds_small_lights
-from mi_ring.fitting.small_lights import find_lobes
 from mi_ring.images import write_image
 from mi_ring.plugins.matte_reflection import softened_cosine, zonal_coefficients
 from mi_ring.rendering import indirect_light, lobe_light, prediction
@@ -290,7 +289,7 @@ def test_a_search_finds_a_small_light_and_none_in_smooth_light(in_the_sun, in_an
             return surface
 
         fit.renderer.show = glossy
-        found = find_lobes(fit.problem, fit.model, fit.renderer, 3, 5).lobes
+        found = small_lights.find_lobes(fit.problem, fit.model, fit.renderer, 3, 5).lobes
         assert (0 if found is None else len(found)) == lamps
         if found is not None:
             assert np.degrees(np.arccos(found.toward[0] @ TOWARD)) < 4
@@ -299,7 +298,7 @@ def test_a_search_finds_a_small_light_and_none_in_smooth_light(in_the_sun, in_an
             assert search.add() and search.share() == pytest.approx(SHARE, abs=0.1)
             with monkeypatch.context() as patch:
                 patch.setattr(small_lights, "FIRST", 0.5)  # a fainter one is not believed
-                assert find_lobes(fit.problem, fit.model, fit.renderer, 3, 5).lobes is None
+                assert small_lights.find_lobes(fit.problem, fit.model, fit.renderer, 3, 5).lobes is None
 
 
 def test_a_fit_moves_lobes_continues_with_them_and_writes_them(in_the_sun, tmp_path, monkeypatch):

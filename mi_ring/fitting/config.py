@@ -117,7 +117,7 @@ class Tuning:
     mesh skips two thirds of the iterations of the first stage. It adds 40 % of the skipped iterations to the second."""
     small_lights: int = 8
     """Most small lights, such as windows, lamps and the sun, that the fit finds in an unknown room: 0 to 32.
-    Beside a flash or other lights none are sought, whatever the number. 0: none are sought."""
+    0: none are sought. Beside a flash or other lights none are sought either."""
     subdivisions: int = 6
     """Level of the mesh in the results, 0 to 8: about 10 · 4^level vertices. This option does not change the fit.
     A fit with --detail chooses the level itself, 7 or 8 for most captures.
@@ -320,7 +320,6 @@ PRESETS: dict[str, dict] = {
         "weights": {"rgb": 1.0, "mask": 0.0, "velocity": 0.01},
         "loss": "l2", "optimizer": "adam", "learning_rate": 1e-4, "decay": 1.0, "velocity_decay": 1.0,
         "precision": "float32", "domain": "sphere", "masks": "given", "shadows": False, "indirect": False,
-        "refine": ("none",), "detail": "none", "diffuse": "lambert", "lobes": "1",
-        "small_lights": 0,
+        "refine": ("none",), "detail": "none", "diffuse": "lambert", "lobes": "1", "small_lights": 0,
     },
 }  # fmt: skip

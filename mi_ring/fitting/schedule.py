@@ -17,7 +17,7 @@ MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they ar
 #: Progress at which small lights of an unknown room are sought: when harmonics have their full order, and later.
 LIGHTS_SOUGHT = 0.36, 0.5, 0.65, 0.8
 COAT_DECIDED = 0.5  #: progress at which a fit decides about a second lobe of highlights
-EARLIEST = 20  #: iterations before either; shorter fits know too little of surface and material
+EARLIEST = 20  #: iterations before a search and that decision: shorter fits know too little of surface and material
 INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
 

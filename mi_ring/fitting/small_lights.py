@@ -37,7 +37,7 @@ RINGS = (6.0, 3.0, 1.5)  #: steps by which a direction is refined [degrees]
 #: second share.
 ADDED, KEPT = 0.05, 0.01
 #: The first lobe must also give this share of all light. While the surface is coarse, a faint lobe explains its errors:
-#: it gave 0.05 under an overcast sky; the sun and windows gave 0.2 and more.
+#: it gave 0.05 to 0.08 under an overcast sky. The first of three windows gave 0.14.
 FIRST = 0.1
 APART = 0.5  #: distance of lobes, relative to the sum of their widths, below which two are one
 
@@ -119,7 +119,7 @@ class LobeSearch:
                 continue
             self.parts.append((photographs, pixels))
             chosen = torch.from_numpy(pixels.astype(np.int64))
-            basis.append(around.transfer.flatten(1, 3).cpu()[:, chosen].movedim(0, 1).nan_to_num())
+            basis.append(around.transfer.flatten(1, 3).cpu()[:, chosen].movedim(0, 1).nan_to_num(0.0, 0.0, 0.0))
             linear = calibration.linear(seen.rgb, index, scale)
             observed.append(linear.reshape(-1, 3)[chosen])
         return torch.cat(basis), torch.cat(observed)
@@ -129,7 +129,7 @@ class LobeSearch:
         parts = [candidate_pictures(self.surface, photographs, pixels, toward, sharpness, self.in_camera, self.seed)
                  for photographs, pixels in self.parts]  # fmt: skip
         parts.append(np.zeros((0, len(toward), 3), np.float32))
-        return torch.from_numpy(np.concatenate(parts)).nan_to_num() * self.weights[:, None, None]
+        return torch.from_numpy(np.concatenate(parts)).nan_to_num(0.0, 0.0, 0.0) * self.weights[:, None, None]
 
     def picture(self, toward: np.ndarray, sharpness: float) -> Tensor:
         """Render the picture (n, 3) of one lobe, weighted like the photographs."""
