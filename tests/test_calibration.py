@@ -691,7 +691,8 @@ def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_c
     unknown = mi_ring.load_capture(small_capture)
     for of, refine, refined in (
         (capture, ("auto",), None), (capture, ("cameras",), ("cameras",)),
-        (unknown, ("auto",), ("light", "power", "falloff", "contrast", "ambient")), (unknown, ("none",), None),
+        (unknown, ("auto",), ("cameras", "light", "power", "falloff", "contrast", "ambient")),
+        (unknown, ("none",), None),
     ):  # fmt: skip
         calibration = Fit(of, Config(refine=refine, domain="sphere")).model.calibration
         assert (calibration and calibration.refined) == refined

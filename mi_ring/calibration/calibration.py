@@ -46,6 +46,9 @@ class Calibration(nn.Module):
     The unit of each parameter is the standard deviation of its Gaussian prior.
     """
 
+    turn: nn.Parameter  #: (cameras, 3) rotations about the camera's axes, if poses are refined
+    move: nn.Parameter  #: (cameras, 3) translations along them
+
     def __init__(
         self, capture: Capture, refined: Sequence[str], rig: Rig, frames: Collection[str] = ("world",)
     ) -> None:

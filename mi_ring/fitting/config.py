@@ -48,10 +48,10 @@ class Common:
     refine: tuple[Unknown, ...] = ("auto",)
     """Calibration that the fit corrects, in addition to surface and material. Initial values come from the scene file.
     auto: light, power, ambient. Also scale, if with these lights the object would reflect more light than it gets.
-    From ten photographs on also falloff, if the lights are a flash beside the lens, whose cone the scene file does not
-    give; not with vignetting. And contrast, if photographs are sRGB files whose curve the scene file does not give.
+    From ten photographs on also cameras; falloff, if the lights are a flash beside the lens, whose cone the scene file
+    does not give, but not with vignetting; contrast, if the photographs' curve is not given, as in most sRGB files.
     With another --light than capture, auto is gain and ambient; for lamps also light and lamps.
-    none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto cameras focal.
+    none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto focal.
     cameras: position and direction of each camera.
     focal, principal: focal length and principal point of each lens.
     distortion: first radial distortion coefficient of each lens.

@@ -58,7 +58,7 @@ class ExposureSolver(torch.optim.Optimizer):
             if k not in self.exposed or not inside.any():
                 continue
             both = torch.stack([it.observation.rgb[n][inside], it.prediction.rgb[n][inside]])  # (2, pixels, 3)
-            quarter = quarters(inside)
+            quarter = quarters(inside)[inside]
             compared = both.amin(0) > (BRIGHT * both.median(1).values.amin(0)).clamp(min=floor)
             for colour in range(3):
                 observed, predicted = both[:, compared[:, colour], colour]
@@ -89,24 +89,29 @@ class ExposureSolver(torch.optim.Optimizer):
 
 
 def quarters(inside: Tensor) -> Tensor:
-    """Number the pixels where `inside` (H, W) is True by the quarter of the object in which they are, 0 to 3."""
-    places = inside.nonzero()
-    low, right = (places > places.double().mean(0)).T
-    return 2 * low + right
+    """Number all pixels (H, W) by the quarter of the object in or beside which they are, 0 to 3.
+
+    `inside` (H, W): True where a pixel shows the object, at least at one.
+    """
+    row, column = inside.nonzero().double().mean(0)
+    height, width = inside.shape
+    low = torch.arange(height, device=inside.device) > row
+    return 2 * low[:, None] + (torch.arange(width, device=inside.device) > column)
 
 
 def shared_part(measured: Tensor) -> Tensor:
-    """Compute how much of the variance of exposures their quarters have in common, for each colour (3,), 0 to 1.
+    """Compute how much of the variance of values the quarters have in common, for each of C kinds (C,), 0 to 1.
 
-    `measured` (P, 5, 3): exposures of photographs and of their quarters; 0: unknown. An exposure times this factor is
-    its best linear estimate. The factor is 1 as long as there are too few photographs whose quarters are all known.
+    `measured` (P, 5, C): values of photographs and of their quarters, such as exposures by colour; 0: unknown. A value
+    times this factor is its best linear estimate. The factor is 1 as long as there are too few photographs whose
+    quarters are all known.
     """
-    result = torch.ones(3)
-    for colour, exposures in enumerate(measured.unbind(-1)):
-        known = exposures[(exposures != 0).all(1)]
+    result = torch.ones(measured.shape[-1])
+    for kind, values in enumerate(measured.unbind(-1)):
+        known = values[(values != 0).all(1)]
         if len(known) >= SEVERAL:
             known = known - known.mean(0)
             pairs = [known[:, a] * known[:, b] for a in range(2, 5) for b in range(1, a)]
             common = torch.stack(pairs).mean()
-            result[colour] = (common / known[:, 0].square().mean().clamp(min=1e-12)).clamp(0, 1)
+            result[kind] = (common / known[:, 0].square().mean().clamp(min=1e-12)).clamp(0, 1)
     return result

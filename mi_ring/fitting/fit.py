@@ -70,7 +70,8 @@ class Fit(Renamed):
         if state is not None and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
         lighting, ring = (lighting, None) if state is None else restored(state)
-        self.problem = problem = Problem.of(capture, config, lighting or Lighting.of(capture, config))
+        lighting = lighting or Lighting.of(capture, config)
+        self.problem = problem = Problem.of(capture, config, lighting, self.loss.usual)
         torch.manual_seed(config.seed)
         self.model = model = Model(problem, (ring or starting_ring(problem, networks)).to(problem.device))
         self.loss.require_velocity(self.ring.shape_net)
@@ -78,7 +79,7 @@ class Fit(Renamed):
         self.plan = lambda config: Schedule.of(config, model.starts_near, settling, model.detail_levels)
         self.schedule = self.plan(config)
         self.sampler, self.renderer = Sampler(self.problem), Renderer(self.problem, self.ring)
-        self.optimisation = Optimisation(self.problem, self.model, self.loss.terms)
+        self.optimisation = Optimisation(self.problem, self.model)
         self.regulariser, self.course = RegulariserStrength(), Course()
         self.capture = self.problem.capture  #: with the masks that are used now
         if state is not None:

@@ -1,7 +1,7 @@
 """The optimisation: Muon for hidden weights, Adam for all other parameters, and one step of all optimisers."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -24,7 +24,6 @@ from mi_ring.fitting.refinement import START, finds_small_lights
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
 from mi_ring.fitting.small_lights import find_lobes
-from mi_ring.fitting.terms import Term
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.system.machine import has_fast_bfloat16
 
@@ -100,9 +99,9 @@ def solve_room(calibration: Calibration, it: Iteration) -> None:
 class Optimisation:
     """The optimisers of a model, their learning rates, the solvers of calibration and the guard against NaN."""
 
-    def __init__(self, problem: Problem, model: Model, terms: Mapping[str, Term]) -> None:
-        """Make the optimisers and solvers for a model. `terms`: the terms of the loss by name."""
-        self.problem, self.model, self.terms = problem, model, terms
+    def __init__(self, problem: Problem, model: Model) -> None:
+        """Make the optimisers and solvers for a model."""
+        self.problem, self.model = problem, model
         self.begin()
 
     def begin(self) -> None:
@@ -119,7 +118,7 @@ class Optimisation:
             if {"falloff", "contrast"} & {*calibration.refined}:
                 self.solvers.append(BrightnessSolver(calibration))
             if "cameras" in calibration.refined:
-                self.solvers.append(PoseSolver(calibration, model.starts_near, self.terms))
+                self.solvers.append(PoseSolver(calibration, model.starts_near))
             self.steppers += calibration_steppers(calibration, config) + lobe_steppers(calibration, config)
             self.steppers += [Stepper(solver, [solver.rate]) for solver in self.solvers]
         self.optimizers = [stepper.optimizer for stepper in self.steppers]

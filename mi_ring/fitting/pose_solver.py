@@ -4,20 +4,24 @@ A fit sees each photograph a few dozen times. Adam's steps do not depend on the 
 cameras away, or are too short for wrong ones. This module computes the curvature from the motion of a picture's pixels
 with its camera. This is direct image alignment, as in "Lucas-Kanade 20 Years On" (Baker and Matthews, IJCV 2004). The
 surface takes the place of the template.
+
+A wrong surface moves a part of a picture, a wrong camera all of it. So only what the quarters of photographs have in
+common is taken for an error of the camera, as in `ExposureSolver`.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.calibration.calibration import Calibration
-from mi_ring.errors import InputError
+from mi_ring.fitting.exposure_solver import quarters, shared_part
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.losses import colour_error, perceived
 from mi_ring.fitting.schedule import Rate
-from mi_ring.fitting.terms import Term, default_terms
 from mi_ring.images import blur
 
 #: Damping: shares of the diagonal, and of its largest entry, that are added to the diagonal. The latter slows down
@@ -69,37 +73,55 @@ def motion(intrinsics: Tensor, size: tuple[int, int], center: Tensor, radius: fl
     return torch.stack([-fx * (right - x[..., None] * forward), -fy * (up - y[..., None] * forward)], -2)
 
 
+class Pull(NamedTuple):
+    """How an iteration's loss pulls at the poses of its photographs."""
+
+    curvature: Tensor  #: (n, 6, 6) Gauss-Newton Hessians with respect to poses [standard deviations of their priors]
+    #: (n, 5, 2) how far the object is moved to the right and downward, from where it would be by the capture's cameras
+    #: [focal lengths]: by the correction so far and what is left of it in the picture, then in each quarter of it
+    shifts: Tensor
+
+
 class PoseSolver(torch.optim.Optimizer):
     """Estimates camera poses, the unknowns `turn` and `move`, by Gauss-Newton steps.
 
     Call `look` in each iteration, then `step`.
     """
 
-    def __init__(self, calibration: Calibration, near: bool, terms: Mapping[str, Term]) -> None:
+    def __init__(self, calibration: Calibration, near: bool) -> None:
         """Prepare to solve for the poses of a calibration.
 
-        `near`: the fit starts near the object, so that steps can begin early. `terms`: the terms of the loss by name.
-        Raises InputError if `rgb` or `mask` is not the default term: `curvature` holds only for the default terms.
+        `near`: the fit starts near the object, so that steps can begin early.
         """
-        for name in "rgb", "mask":
-            if terms.get(name, default_terms[name]) is not default_terms[name]:
-                raise InputError(f"terms: {name}: must be the default one for --refine cameras, which has to know how "
-                                 "it changes with them; give yours another name")  # fmt: skip
         super().__init__([{"params": [calibration.turn, calibration.move]}], {"lr": INITIAL})
         self.rate = Rate(INITIAL, DECAY, NEAR if near else FAR)
-        self.seen: tuple[Tensor, Tensor] | None = None  #: cameras and their curvature
         self.camera = calibration.rig.camera  #: (P,) number of each photograph's camera
+        self.state[calibration.turn] = {"measured": torch.zeros(len(calibration.turn), 5, 2)}
+        self.seen: tuple[Tensor, Tensor] | None = None  #: cameras and their curvature
+
+    @property
+    def measured(self) -> Tensor:
+        """(cameras, 5, 2): the shifts in the last picture seen of each camera, see `Pull`; 0: unknown."""
+        (group,) = self.param_groups
+        return self.state[group["params"][0]]["measured"]
+
+    @property
+    def shared(self) -> float:
+        """How much of the variance of shifts the quarters of photographs have in common, 0 to 1."""
+        return float(shared_part(torch.cat(self.measured.unbind(-1))[..., None]))
 
     def look(self, it: Iteration) -> None:
-        """Store the numbers of an iteration's cameras and the Gauss-Newton Hessians of its loss, for `step`."""
+        """Store the numbers of an iteration's cameras, the Hessians of its loss and the shifts, for `step`."""
         self.seen = None
         if it.progress >= self.rate.start:
             cameras = self.camera[torch.from_numpy(it.batch.all_photographs)]
-            self.seen = summed(cameras, it.batch.share.gathered(curvature(it)))
+            matrices, shifts = map(it.batch.share.gathered, pull(it))
+            self.measured[cameras] = shifts
+            self.seen = summed(cameras, matrices)
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
-        """Change the poses of the cameras that `look` has stored, by a Gauss-Newton step.
+        """Move the poses of the cameras that `look` has stored to where a Gauss-Newton step leads, times `shared`.
 
         Does nothing before refinement begins.
         """
@@ -112,9 +134,10 @@ class PoseSolver(torch.optim.Optimizer):
         own = matrix.diagonal(dim1=1, dim2=2)
         damped = matrix + torch.diag_embed(DAMPING * own + FLOOR * own.amax(1, keepdim=True))
         step = torch.linalg.solve(damped, gradient)
-        step *= group["lr"] * (LONGEST / step.norm(dim=1, keepdim=True)).clamp(max=1)
-        turn[index] -= step[:, :3]
-        move[index] -= step[:, 3:]
+        step *= (LONGEST / step.norm(dim=1, keepdim=True)).clamp(max=1)
+        pose = torch.cat([turn[index], move[index]], 1)
+        pose += group["lr"] * (self.shared * (pose - step) - pose)
+        turn[index], move[index] = pose[:, :3], pose[:, 3:]
 
 
 def summed(cameras: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
@@ -129,43 +152,86 @@ def summed(cameras: Tensor, matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def curvature(it: Iteration) -> Tensor:
-    """Compute the Gauss-Newton Hessian (n, 6, 6) of an iteration's loss with respect to the pose of each photograph.
+def pull(it: Iteration) -> Pull:
+    """Compute how an iteration's loss pulls at the pose of each photograph.
 
-    The pose is three rotations and three translations [standard deviations of their priors]. The Hessian contains
-    colours, silhouettes and prior. It approximates the surface by a sphere. Absolute differences are treated by
-    iteratively reweighted least squares; those below the mean get the weight of the mean.
+    A pose is three rotations and three translations [standard deviations of their priors]. The surface is approximated
+    by a sphere.
     """
-    context, seen, prediction = it.context, it.observation, it.prediction
-    calibration, (n, height, width) = context.model.calibration, prediction.coverage.shape
+    model, covered = it.context.model, it.prediction.coverage.cpu() > 0.5
+    calibration, n = model.calibration, len(covered)
     assert calibration is not None
-    rig, kind, counted = calibration.rig, context.config.loss, it.counted()
-    error = colour_error(prediction.rgb, seen.rgb, seen.clipped, context.exposure, kind, counted).abs()
-    if kind == "l2":
-        weight = 2 * torch.ones_like(error)
-    else:
-        covered = error[prediction.coverage > 0.5]
-        total, count = it.batch.share.sum(torch.stack([covered.sum(), torch.ones_like(covered).sum()]))
-        mean = (total / count).nan_to_num(1.0).clamp(min=1e-6)
-        weight = 1 / error.maximum(mean)
-    weight *= ~seen.clipped | (error > 0)  # where it is clipped, a prediction may be brighter
-    if counted is not None:
-        weight *= counted[..., None]
-    weight *= it.weights.get("rgb", 0.0) / (len(it.batch.all_photographs) * weight[0].numel())
-    colours = perceived(prediction.rgb, context.exposure, kind)
-    silhouettes = blur(prediction.coverage, it.outline_blur())
-    masked = max(1.0, float(it.batch.share.sum(seen.masked.sum())))
-    mask_weight = 2 * it.weights.get("mask", 0.0) / (masked * height * width)
-
-    at, radius = calibration(it.batch.scale), float(context.model.ring.radius)
+    rig, at, radius = calibration.rig, calibration(it.batch.scale), float(model.ring.radius)
     unit = torch.tensor([calibration.widths["turn"]] * 3 + [rig.distance * calibration.widths["move"]] * 3)
     prior = it.weights.get("calibration", 0.0) / len(rig)
-    result = torch.eye(6).repeat(n, 1, 1) * max(prior, LEAST)
-    for i, k in enumerate(it.batch.photographs):
+    matrices, shifts = torch.eye(6).repeat(n, 1, 1) * max(prior, LEAST), torch.zeros(n, 5, 2)
+    poses = torch.cat([calibration.turn, calibration.move], 1)
+    for i, (k, (corner, first, second)) in enumerate(zip(it.batch.photographs, derivatives(it))):
         center = at.cameras[k, :, :3].T @ (rig.center - at.cameras[k, :, 3])
-        moving = motion(at.intrinsics[k], (width, height), center, radius) * unit
-        colour, outline = slopes(colours[i]), slopes(silhouettes[i, ..., None])
-        structure = torch.einsum("hwc,hwca,hwcb->hwab", weight[i], colour, colour)
-        structure = structure + mask_weight * seen.masked[i] * torch.einsum("hwca,hwcb->hwab", outline, outline)
-        result[i] += torch.einsum("hwaj,hwab,hwbk->jk", moving, structure.cpu(), moving)
-    return result
+        (left, top), (height, width) = corner, first.shape[:2]
+        intrinsics = at.intrinsics[k] - torch.tensor([0, 0, left, top])
+        moving = motion(intrinsics, (width, height), center, radius) * unit
+        matrices[i] += moving.reshape(-1, 6).T @ (second @ moving).reshape(-1, 6)
+        inside = covered[i, top : top + height, left : left + width]
+        if inside.any():
+            so_far = (moving[inside] @ poses[rig.camera[k]]).mean(0)
+            shifts[i] = (so_far + shifts_left(first, second, inside)) / intrinsics[:2]
+    return Pull(matrices, shifts)
+
+
+def derivatives(it: Iteration) -> Iterator[tuple[tuple[int, int], Tensor, Tensor]]:
+    """Compute the derivatives of an iteration's loss with respect to a shift of each pixel [px], for each photograph.
+
+    Yields the left upper corner of a box of H × W pixels, beside which nothing depends on a shift, and of colours and
+    silhouettes in this box the negative gradient (H, W, 2) and the Gauss-Newton Hessian (H, W, 2, 2). Absolute
+    differences are treated by iteratively reweighted least squares; those below the mean get the weight of the mean.
+    """
+    context, seen, prediction = it.context, it.observation, it.prediction
+    kind, counted, sigma = context.config.loss, it.counted(), it.outline_blur()
+    error = colour_error(prediction.rgb, seen.rgb, seen.clipped, context.exposure, kind, counted)
+    size = error.abs()
+    covered = size[prediction.coverage > 0.5]
+    total, count = it.batch.share.sum(torch.stack([covered.sum(), torch.ones_like(covered).sum()]))
+    least = (total / count).nan_to_num(1.0).clamp(min=1e-6)
+    colour_weight = it.weights.get("rgb", 0.0) / (len(it.batch.all_photographs) * error[0].numel())
+    masked = max(1.0, float(it.batch.share.sum(seen.masked.sum())))
+    mask_weight = 2 * it.weights.get("mask", 0.0) / (masked * seen.mask[0].numel())
+    for i in range(len(error)):
+        left, top, box = object_box(prediction.coverage[i], 3 * sigma)
+        weight = 2 * torch.ones_like(size[i][box]) if kind == "l2" else 1 / size[i][box].maximum(least)
+        weight *= colour_weight * (~seen.clipped[i][box] | (size[i][box] > 0))  # if clipped, more is no error
+        if counted is not None:
+            weight *= counted[i][box][..., None]
+        colour = slopes(perceived(prediction.rgb[i][box], context.exposure, kind))
+        first = torch.einsum("hwc,hwc,hwca->hwa", weight, error[i][box], colour)
+        second = torch.einsum("hwc,hwca,hwcb->hwab", weight, colour, colour)
+        if seen.masked[i] and mask_weight:
+            silhouette, mask = (blur(cover[i][box], sigma)[..., None] for cover in (prediction.coverage, seen.mask))
+            outline = slopes(silhouette)[..., 0, :]
+            first = first + mask_weight * (silhouette - mask) * outline
+            second = second + mask_weight * torch.einsum("hwa,hwb->hwab", outline, outline)
+        yield (left, top), first.cpu(), second.cpu()
+
+
+def object_box(coverage: Tensor, margin: float) -> tuple[int, int, tuple[slice, slice]]:
+    """Find the pixels where coverage (H, W) is not 0, and a margin [px] around: (left, top, (rows, columns))."""
+    ranges = []
+    for axis in (0, 1):
+        where, more = coverage.amax(axis).nonzero()[:, 0].tolist() or [0], math.ceil(margin) + 1
+        ranges.append(slice(max(0, where[0] - more), where[-1] + more + 1))
+    columns, rows = ranges
+    return columns.start, rows.start, (rows, columns)
+
+
+def shifts_left(first: Tensor, second: Tensor, inside: Tensor) -> Tensor:
+    """Compute by least squares how far a picture is from the photograph, and each quarter of it: (5, 2) [px].
+
+    `first`, `second`: as `derivatives` yields them. `inside` (H, W): the object's pixels.
+    """
+    part = (quarters(inside)[..., None] == torch.arange(4)).to(first)
+    gradient, matrix = torch.einsum("hwq,hwa->qa", part, first), torch.einsum("hwq,hwab->qab", part, second)
+    gradient = torch.cat([gradient.sum(0, keepdim=True), gradient])
+    matrix = torch.cat([matrix.sum(0, keepdim=True), matrix])
+    own = matrix.diagonal(dim1=1, dim2=2)
+    damped = matrix + torch.diag_embed(FLOOR * own.amax(1, keepdim=True).expand_as(own) + LEAST)
+    return torch.linalg.solve(damped, gradient)

@@ -27,6 +27,7 @@ class Problem:
     scene: mi.Scene  #: without the environment, if `environment` has it
     config: Config
     lighting: Lighting
+    usual_loss: bool  #: Are `rgb` and `mask` the default terms of the loss?
     environment: np.ndarray | None  #: (BASIS, 3) of the scene's environment, see `environment_as_harmonics`
     fitted: np.ndarray  #: indices of the photographs that are fitted
     held_out: np.ndarray  #: indices of the others
@@ -35,13 +36,13 @@ class Problem:
     device: torch.device
 
     @classmethod
-    def of(cls, capture: Capture, config: Config, lighting: Lighting) -> "Problem":
+    def of(cls, capture: Capture, config: Config, lighting: Lighting, usual_loss: bool) -> "Problem":
         """Prepare the problem of a fit. Large photographs are reduced, and some photographs are held out.
 
         A deterministic fit changes the normals of the scene's meshes.
 
-        `lighting`: the light that the fit assumes. Raises InputError if no photograph is left to fit, or if the object
-        is black in all photographs.
+        `lighting`: the light that the fit assumes. `usual_loss`: its terms `rgb` and `mask` are the default ones.
+        Raises InputError if no photograph is left to fit, or if the object is black in all photographs.
         """
         if config.deterministic:
             recompute_normals(capture.scene)
@@ -50,8 +51,8 @@ class Problem:
         fitted = np.setdiff1d(np.arange(len(capture)), held_out)
         as_lit, scene, environment = environment_as_harmonics(with_lighting(capture, lighting))
         seen = as_lit.part(fitted) if len(held_out) else as_lit
-        return cls(given, as_lit, seen, scene, config, lighting, environment, fitted, held_out, seen.exposure(),
-                   current(), device())  # fmt: skip
+        return cls(given, as_lit, seen, scene, config, lighting, usual_loss, environment, fitted, held_out,
+                   seen.exposure(), current(), device())  # fmt: skip
 
 
 def held_out_photographs(capture: Capture, every: int) -> np.ndarray:

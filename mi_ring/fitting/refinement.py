@@ -17,14 +17,14 @@ from mi_ring.fitting.problem import Problem
 from mi_ring.scene.assembly import has_table, lamps_of
 from mi_ring.scene.lights import shared_emitters
 
-#: What `--refine auto` stands for; `falloff` is added for a flash that moves with the camera and has no known cone,
-#: `contrast` for sRGB files of an unknown camera, `scale` where the lights' intensities cannot be true. Of a flash it
-#: refines the place beside the lens: a flash farther ahead looks like a darker surface. Not `curve`: it looks like
-#: another reflectance, too.
+#: What `--refine auto` stands for. With enough photographs, `cameras` are added, `falloff` for a flash that moves with
+#: the camera and has no known cone, and `contrast` for sRGB files of an unknown camera. `scale` is added where the
+#: lights' intensities cannot be true. Of a flash, the place beside the lens is refined: a flash farther ahead looks
+#: like a darker surface. Not `curve`: it looks like another reflectance, too.
 AUTO = "light", "power", "ambient"
 #: What is refined under each kind of unknown light.
 UNDER_UNKNOWN_LIGHT = {"environment": {"ambient"}, "turntable": {"ambient"}, "lamps": {"light", "ambient", "lamps"}}
-FEWEST = 10  #: photographs that tell cone and contrast: fewer do not show how much their errors differ
+FEWEST = 10  #: photographs that tell cone, contrast and poses: fewer do not show how much their errors differ
 TOLD_BY_MANY = {"falloff", "contrast"}  #: these options need that many
 START = 0.2  #: progress of the fit at which refinement begins
 
@@ -43,7 +43,9 @@ class Refinement(NamedTuple):
         `power` of the result is 1, unless the lights' strengths are refined and those of the capture are impossibly
         weak. It is then the factor of all lights that gives the object a usual albedo.
 
-        Raises InputError if `falloff` or `contrast` is asked for with fewer than 10 photographs.
+        Raises InputError if `falloff` or `contrast` is asked for with fewer than 10 photographs, or `cameras` with
+        terms `rgb` or `mask` of the loss that are not the default ones: the solver of poses has to know how they
+        change with poses.
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo, capture, config = math.pi * reflectance, problem.capture, problem.config
@@ -52,10 +54,14 @@ class Refinement(NamedTuple):
         if asked and not several:
             raise InputError(f"{capture.path}: --refine {min(asked)}: the fit has {count} photographs with a light of "
                              f"their own, which do not tell it; leave it out, or give at least {FEWEST}")  # fmt: skip
+        if "cameras" in config.refine and not problem.usual_loss:
+            raise InputError("terms: rgb, mask: must be the default ones for --refine cameras, which has to know how "
+                             "they change with them; give yours other names")  # fmt: skip
         open_unknowns: set[str] = set()
         if several and "auto" in config.refine and not capture.known:
             open_unknowns |= {"falloff"} if Rig(capture, center, problem.exposure).open_cone else set()
             open_unknowns |= {"contrast"} if has_open_curve(capture.shots) else set()
+            open_unknowns |= {"cameras"} if problem.usual_loss else set()
         refined = refined_of(problem.seen, config, problem.lighting.kind, albedo, open_unknowns)
         return cls(reflectance, refined, albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0)
 
@@ -71,7 +77,8 @@ def refined_of(
     """List the values of `--refine` that a fit refines, in a fixed order. The capture decides what `auto` means.
 
     `light`: kind of the light, such as "capture" or "lamps". `albedo`: of the object, computed from the lights'
-    strengths. `open_unknowns`: those of `falloff` and `contrast` that photographs can tell and the scene file does not.
+    strengths. `open_unknowns`: those of `cameras`, `falloff` and `contrast` that photographs can tell better than the
+    scene file.
     """
     names: set[str] = set(config.refine)
     auto = "auto" in names and not capture.known

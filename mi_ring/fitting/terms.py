@@ -136,6 +136,11 @@ class Loss:
         if unknown := set(weights) - set(default_terms) - set(self.terms):
             raise InputError(f"weights: {min(unknown)}: there is no such term; there are {', '.join(self.terms)}")
 
+    @property
+    def usual(self) -> bool:
+        """Return True if the terms `rgb` and `mask` are the default ones, or left out."""
+        return all(self.terms.get(name, default_terms[name]) is default_terms[name] for name in ("rgb", "mask"))
+
     def weight(self, name: str) -> float:
         """Return the weight of the term `name`; 0 if there is no such term.
 
