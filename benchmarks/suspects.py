@@ -116,7 +116,7 @@ SUSPECTS = {
     "exponent": Suspect("--refine auto curve", encoded=lambda v: linear_to_srgb(srgb_to_linear(v) ** 1.2)),
     "JPEG": Suspect(encoded=compressed),
     "blocky masks": Suspect("--refine auto masks", mask=blocky),
-    "poses": Suspect("--refine auto cameras", pose=moved),
+    "poses": Suspect(pose=moved),
 }
 
 
