@@ -122,7 +122,7 @@ def main() -> None:
           f"mi_ring.fit --light environment {' '.join(options)}\n", flush=True)  # fmt: skip
     rows = []
     for mesh in args.meshes:
-        name = mesh.parents[1].name if mesh.name == "mesh.ply" else mesh.stem
+        name = mesh.resolve().parents[1].name if mesh.name == "mesh.ply" else mesh.stem
         usual = ["--material", PLASTIC, "--novel", 0]
         for light in [*args.maps, *(["flash"] if args.flash else [])]:
             capture, fit = args.out / f"{name}-{light}", args.out / f"{name}-{light}-fit"

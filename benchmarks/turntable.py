@@ -38,7 +38,7 @@ ROOM = ("--light", "none", "--room", 1, "--room-kind", "windows", "--wrong-room"
 def true_albedo(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """Mean albedo (n,) of the stripes at `points` (n, 3) of the object with `vertices` (V, 3)."""
     low, high = vertices[:, 1].min(), vertices[:, 1].max()
-    stripe = (STRIPES * (points[:, 1] - low) / (high - low)).astype(int) % 2
+    stripe = (STRIPES * (points[:, 1] - low) / (high - low)).astype(int).clip(0, STRIPES - 1) % 2
     return np.mean(COLOURS, 1)[stripe]
 
 
@@ -74,7 +74,7 @@ def main() -> None:
     first, second = (f"principled base_color={','.join(map(str, c))} roughness={ROUGHNESS}" for c in COLOURS)
     rows = []
     for mesh in args.meshes:
-        name = mesh.parents[1].name if mesh.name == "mesh.ply" else mesh.stem
+        name = mesh.resolve().parents[1].name if mesh.name == "mesh.ply" else mesh.stem
         for room in range(args.rooms):
             out = args.out / f"{name}-{room}"
             run("mi_ring.synthesize", mesh, out, "--material", first, "--second", second, "--bands", STRIPES,

@@ -23,8 +23,8 @@ class CheckConfig:
     object]; angle between camera and light, seen from the object [deg]; share of the photograph that shows the object;
     shares of the object that are overexposed and dark; brightness of the background relative to the object; brightness
     of the object relative to the other photographs, after division by the strength of the light; share of the mask that
-    the other masks confirm. On the contact sheet, masks have a red outline, invalid pixels are yellow and the visual
-    hull is green. The exit status is 1 if there is something to correct.
+    the other masks confirm. On the contact sheet, masks have a green outline, invalid pixels are red and the visual
+    hull is blue. The exit status is 1 if there is something to correct.
     """
 
     scene: Positional[Annotated[Path, arg(metavar="SCENE.xml")]]

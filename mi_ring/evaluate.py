@@ -46,7 +46,7 @@ class EvaluateConfig:
     align: Literal["rigid", "similarity"] | None = None
     """Align the true surface and the photographs of --novel with the fit before the comparison.
     rigid: by rotation and translation. similarity: also by scale. Results for the fit's own photographs do not change.
-    Use this option after a fit with --refine cameras: such a fit may move the whole object."""
+    Use this option after a fit that refined cameras: it may have moved the whole object."""
     spp: int = SPP
     """Samples per pixel of the predicted photographs. More samples give less noise and take longer."""
     out: Path | None = None

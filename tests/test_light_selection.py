@@ -36,10 +36,10 @@ DECISIONS = [
     ("auto", {"environment": 0.095, "1 lamp": 0.094, "turntable": 0.085, "capture": 0.1}, "capture", 0),
     ("auto", {"environment": None, "turntable": 0.05, "capture": 0.1, "turntable on one material": 0.09},
      "turntable", 0),
-    ("auto", {"environment": 0.08, "1 lamp": 0.085, "turntable": 0.085, "capture": 0.1, "2 lamps": 0.06, "3 lamps": 0.06,
-              "2 distant lamps": 0.09, "2 lamps on one material": 0.08}, "2 lamps", 0),
-    ("auto", {"environment": 0.08, "1 lamp": 0.095, "turntable": 0.085, "capture": 0.1, "2 lamps": 0.09, "3 lamps": 0.09,
-              "1 distant lamp": 0.09, "2 distant lamps": 0.09, "environment on one material": 0.09},
+    ("auto", {"environment": 0.08, "1 lamp": 0.085, "turntable": 0.085, "capture": 0.1, "2 lamps": 0.06,
+              "3 lamps": 0.06, "2 distant lamps": 0.09, "2 lamps on one material": 0.08}, "2 lamps", 0),
+    ("auto", {"environment": 0.08, "1 lamp": 0.095, "turntable": 0.085, "capture": 0.1, "2 lamps": 0.09,
+              "3 lamps": 0.09, "1 distant lamp": 0.09, "2 distant lamps": 0.09, "environment on one material": 0.09},
      "environment on one material", 0.35),
 ]  # fmt: skip
 

@@ -13,10 +13,10 @@ import mi_ring
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Observation
-from mi_ring.fitting import losses
+from mi_ring.fitting import losses, pose_solver
 from mi_ring.fitting.exposure_solver import ExposureSolver, quarters, shared_part
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.pose_solver import motion, pull, shifts_left, slopes
+from mi_ring.fitting.pose_solver import Pull, motion, pull, shifts_left, slopes
 from mi_ring.fitting.processes import ALONE
 from mi_ring.fitting.schedule import Stage
 from mi_ring.geometry.camera import Camera
@@ -108,7 +108,8 @@ def test_curvature_is_that_of_the_loss(small_capture, kind):
     weights |= {"colours": {"mask": 0.0}, "silhouettes": {"rgb": 0.0}, "both": {}}[kind]
     width, height = capture.shots[0].size
     context = SimpleNamespace(model=SimpleNamespace(calibration=calibration, ring=SimpleNamespace(radius=radius)),
-                              config=mi_ring.Config(loss="l2"), exposure=0.3, capture=SimpleNamespace(lit_room=False),
+                              config=mi_ring.Config(loss="l2"), exposure=0.3,
+                              capture=SimpleNamespace(lit_room=False, threshold=None),
                               schedule=SimpleNamespace(outline_blur=lambda progress, width: 1.5))  # fmt: skip
     batch = SimpleNamespace(progress=0.5, photographs=index, all_photographs=index, size=(width, height), scale=1,
                             stage=Stage(2, 28, 0, 9), share=ALONE.share(len(index)))  # fmt: skip
@@ -166,6 +167,41 @@ def test_shifts_are_found_of_pictures_and_of_their_quarters():
     one = shifts_left(((shown - moved) * part)[..., None] * slope, second, inside)
     np.testing.assert_allclose(one[1:], np.outer([0, 0, 0, 1], [0.3, -0.2]), atol=0.02)
     assert one[0].abs().max() < 0.1
+    # A quarter without structure, or with some in one direction alone, tells nothing. Nor does a pixel that is NaN.
+    flat = slope.clone()
+    flat[..., 1] *= ~((x < 27.5) & (y < 19.5))
+    second = torch.einsum("hwa,hwb->hwab", flat, flat)
+    found = shifts_left((shown - moved)[..., None] * flat, second * ~part[..., None, None], inside)
+    assert found.isnan().all(1).tolist() == [False, True, False, False, True]
+    second[8, 12] = torch.nan
+    assert shifts_left((shown - moved)[..., None] * flat, second, inside).isnan().all()
+
+
+def test_shifts_that_are_unknown_are_not_stored(small_capture, monkeypatch):
+    """The last that was known stays. Two photographs of a pair have one camera."""
+    fit, index = posed(small_capture, batch=3)
+    (solver,) = fit.optimisation.solvers
+    given = torch.arange(1.0, 31).reshape(3, 5, 2)
+    given[1, 2:] = torch.nan
+    given[2, :2] = 0
+    solver.camera[index[2]] = solver.camera[index[1]]
+    monkeypatch.setattr(pose_solver, "pull", lambda it: Pull(torch.eye(6).repeat(3, 1, 1), given))
+    solver.look(iteration_of(fit))
+    assert torch.equal(solver.measured[index[0]], given[0])
+    assert torch.equal(solver.measured[index[1]], torch.cat([given[1, :2], given[2, 2:]]))
+    assert len(solver.seen[0]) == 2
+
+
+def test_the_same_shift_of_all_pictures_is_no_evidence(small_capture):
+    fit, _ = posed(small_capture)
+    (solver,) = fit.optimisation.solvers
+    random = torch.Generator().manual_seed(1)
+    shifts = torch.randn(solver.measured.shape, generator=random)
+    shifts[:, 0] = shifts[:, 1:].mean(1)
+    solver.measured[:] = shifts + torch.tensor([0.0, 100.0])
+    assert solver.shared < 0.5
+    solver.measured[:] += 5 * torch.randn(len(shifts), 1, 2, generator=random)
+    assert solver.shared > 0.8
 
 
 def centers(calibration, index):

@@ -51,7 +51,7 @@ class Common:
     From ten photographs on also cameras; falloff, if the lights are a flash beside the lens, whose cone the scene file
     does not give, but not with vignetting; contrast, if the photographs' curve is not given, as in most sRGB files.
     With another --light than capture, auto is gain and ambient; for lamps also light and lamps.
-    none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto focal.
+    none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto principal.
     cameras: position and direction of each camera.
     focal, principal: focal length and principal point of each lens.
     distortion: first radial distortion coefficient of each lens.

@@ -30,8 +30,8 @@ FITS = {"auto": 8, "lamps": 6, "environment": 2, "turntable": 2}
 LAST = 12  #: last iterations of a coarse fit whose mean error counts
 ALIKE = 1.1  #: ratio of the lights' strengths above which a message is printed
 #: Another light than the scene's is chosen only if its error is below this share of the error with the scene's lights.
-#: An environment fixed in the camera looks much like a flash: its errors were 1.3 to 1.7 times those of a true flash,
-#: and 0.65 times those of a flash in rooms with windows. If the background shows that the object turned, it has no
+#: An environment fixed in the camera looks much like a flash. Under a true flash its error was 1.3 to 1.7 times that of
+#: the flash, in rooms with windows 0.65 times. If the background shows that the object turned, it has no
 #: rival that is fixed in the world, and the limit of an environment.
 BETTER = {"environment": 0.9, "turntable": 0.8, "lamps": 0.9}
 MOST = 3  #: lamps

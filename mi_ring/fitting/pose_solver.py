@@ -22,6 +22,7 @@ from mi_ring.fitting.exposure_solver import quarters, shared_part
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.losses import colour_error, perceived
 from mi_ring.fitting.schedule import Rate
+from mi_ring.fitting.terms import doubt, shows
 from mi_ring.images import blur
 
 #: Damping: shares of the diagonal, and of its largest entry, that are added to the diagonal. The latter slows down
@@ -30,6 +31,7 @@ DAMPING, FLOOR = 0.1, 0.01
 LONGEST = 3.0  #: longest step [standard deviations]
 INITIAL, DECAY = 1.0, 0.5  #: factor of the steps: it decreases to average over iterations
 LEAST = 1e-9  #: least curvature: what photographs do not determine stays unchanged
+TOLD = 0.05  #: least structure that tells a shift, relative to that in the other direction, and of the whole picture
 NEAR, FAR = 0.2, 0.4  #: progress at which steps begin, for a start near the object and far from it
 
 
@@ -78,7 +80,8 @@ class Pull(NamedTuple):
 
     curvature: Tensor  #: (n, 6, 6) Gauss-Newton Hessians with respect to poses [standard deviations of their priors]
     #: (n, 5, 2) how far the object is moved to the right and downward, from where it would be by the capture's cameras
-    #: [focal lengths]: by the correction so far and what is left of it in the picture, then in each quarter of it
+    #: [focal lengths]: by the correction so far and what is left of it in the picture, then in each quarter of it; NaN
+    #: or 0: unknown
     shifts: Tensor
 
 
@@ -107,8 +110,11 @@ class PoseSolver(torch.optim.Optimizer):
 
     @property
     def shared(self) -> float:
-        """How much of the variance of shifts the quarters of photographs have in common, 0 to 1."""
-        return float(shared_part(torch.cat(self.measured.unbind(-1))[..., None]))
+        """How much of the variance of shifts, in both directions, the quarters have in common, 0 to 1."""
+        known = (self.measured != 0).all(1, keepdim=True)
+        mean = (known * self.measured).sum(0) / known.sum(0).clamp(min=1)
+        centred = torch.where(known, self.measured - mean, 0)
+        return float(shared_part(torch.cat(centred.unbind(-1))[..., None]))
 
     def look(self, it: Iteration) -> None:
         """Store the numbers of an iteration's cameras, the Hessians of its loss and the shifts, for `step`."""
@@ -116,7 +122,9 @@ class PoseSolver(torch.optim.Optimizer):
         if it.progress >= self.rate.start:
             cameras = self.camera[torch.from_numpy(it.batch.all_photographs)]
             matrices, shifts = map(it.batch.share.gathered, pull(it))
-            self.measured[cameras] = shifts
+            for camera, shift in zip(cameras.tolist(), shifts):
+                known = shift.isfinite() & (shift != 0)
+                self.measured[camera] = torch.where(known, shift, self.measured[camera])
             self.seen = summed(cameras, matrices)
 
     @torch.no_grad()
@@ -206,10 +214,13 @@ def derivatives(it: Iteration) -> Iterator[tuple[tuple[int, int], Tensor, Tensor
         first = torch.einsum("hwc,hwc,hwca->hwa", weight, error[i][box], colour)
         second = torch.einsum("hwc,hwca,hwcb->hwab", weight, colour, colour)
         if seen.masked[i] and mask_weight:
-            silhouette, mask = (blur(cover[i][box], sigma)[..., None] for cover in (prediction.coverage, seen.mask))
-            outline = slopes(silhouette)[..., 0, :]
-            first = first + mask_weight * (silhouette - mask) * outline
-            second = second + mask_weight * torch.einsum("hwa,hwb->hwab", outline, outline)
+            shown = shows(it)[i][box] if seen.valid is None else (shows(it) & seen.valid)[i][box]
+            coverage = prediction.coverage[i][box]
+            outline = blur(shown * slopes(coverage[..., None])[..., 0, :].movedim(-1, 0), sigma).movedim(0, -1)
+            off = blur(torch.where(shown, coverage, 0) - seen.mask[i][box], sigma)
+            trusted = mask_weight / (1 + off.square() / doubt(it) ** 2).square()
+            first = first + (trusted * off)[..., None] * outline
+            second = second + trusted[..., None, None] * torch.einsum("hwa,hwb->hwab", outline, outline)
         yield (left, top), first.cpu(), second.cpu()
 
 
@@ -226,12 +237,17 @@ def object_box(coverage: Tensor, margin: float) -> tuple[int, int, tuple[slice, 
 def shifts_left(first: Tensor, second: Tensor, inside: Tensor) -> Tensor:
     """Compute by least squares how far a picture is from the photograph, and each quarter of it: (5, 2) [px].
 
-    `first`, `second`: as `derivatives` yields them. `inside` (H, W): the object's pixels.
+    NaN: the quarter has too little structure in one direction, or compared with the whole. `first`, `second`: as
+    `derivatives` yields them. `inside` (H, W): the object's pixels.
     """
     part = (quarters(inside)[..., None] == torch.arange(4)).to(first)
     gradient, matrix = torch.einsum("hwq,hwa->qa", part, first), torch.einsum("hwq,hwab->qab", part, second)
     gradient = torch.cat([gradient.sum(0, keepdim=True), gradient])
     matrix = torch.cat([matrix.sum(0, keepdim=True), matrix])
-    own = matrix.diagonal(dim1=1, dim2=2)
-    damped = matrix + torch.diag_embed(FLOOR * own.amax(1, keepdim=True).expand_as(own) + LEAST)
-    return torch.linalg.solve(damped, gradient)
+    if not matrix.isfinite().all():
+        return torch.full_like(gradient, torch.nan)
+    least, most = torch.linalg.eigvalsh(matrix).T
+    told = (least > LEAST) & (least > TOLD * most) & (most > TOLD * most[0])
+    eye = torch.eye(2).expand_as(matrix)
+    shifts = torch.linalg.solve(torch.where(told[:, None, None], matrix, eye), gradient)
+    return torch.where(told[:, None], shifts, torch.nan)

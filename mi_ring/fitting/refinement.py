@@ -10,7 +10,7 @@ from mi_ring.calibration.calibration import OPTIONS, Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import ALBEDO, Capture
 from mi_ring.capture.decoding import has_open_curve
-from mi_ring.capture.pairs import varies_in_exposure
+from mi_ring.capture.pairs import camera_numbers, varies_in_exposure
 from mi_ring.errors import InputError
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.problem import Problem
@@ -61,7 +61,7 @@ class Refinement(NamedTuple):
         if several and "auto" in config.refine and not capture.known:
             open_unknowns |= {"falloff"} if Rig(capture, center, problem.exposure).open_cone else set()
             open_unknowns |= {"contrast"} if has_open_curve(capture.shots) else set()
-            open_unknowns |= {"cameras"} if problem.usual_loss else set()
+            open_unknowns |= {"cameras"} if problem.usual_loss and moves_alone(problem.seen) else set()
         refined = refined_of(problem.seen, config, problem.lighting.kind, albedo, open_unknowns)
         return cls(reflectance, refined, albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0)
 
@@ -69,6 +69,12 @@ class Refinement(NamedTuple):
     def albedo(self) -> float:
         """Albedo of the object, computed from the lights' intensities. If it exceeds 1, the intensities are wrong."""
         return math.pi * self.reflectance
+
+
+def moves_alone(capture: Capture) -> bool:
+    """Test whether a capture has enough cameras, none of which is also that of a photograph under another light."""
+    cameras = {shot.camera.to_world.tobytes() for shot in capture.shots}
+    return len(cameras) >= FEWEST and len(cameras) == len({*camera_numbers(capture).tolist()})
 
 
 def refined_of(

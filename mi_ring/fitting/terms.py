@@ -42,23 +42,38 @@ def rgb(it: Iteration) -> Tensor:
 def mask(it: Iteration) -> Tensor | None:
     """Compute the term `mask`: the difference between predicted silhouettes and masks.
 
-    Returns None if no photograph of the batch has a mask. In a lit room a mask may be wrong: for example, it may
-    contain a shadow. So large differences count less there in the second half of the fit.
+    Returns None if no photograph of the batch has a mask.
     """
-    seen, context = it.observation, it.context
+    seen = it.observation
     masked = float(it.batch.share.sum(seen.masked.sum()))
     if not masked:
         return None
-    coverage, threshold = it.prediction.coverage, context.capture.threshold
-    if threshold is not None:  # such masks show only the bright part of the object
-        lit = torch.maximum(seen.rgb, it.prediction.rgb.detach()).amax(-1) > threshold
-        coverage = torch.where(lit, coverage, 0)
     valid = None if seen.valid is None else seen.valid[seen.masked]
-    doubt = DOUBT if context.capture.lit_room and it.progress > SETTLED else math.inf
     if not seen.masked.any():  # only photographs of other processes have one
         return 0 * it.prediction.coverage.sum()
-    loss = mask_loss(coverage[seen.masked], seen.mask[seen.masked], it.outline_blur(), valid, doubt)
+    coverage = torch.where(shows(it), it.prediction.coverage, 0)[seen.masked]
+    loss = mask_loss(coverage, seen.mask[seen.masked], it.outline_blur(), valid, doubt(it))
     return loss * (int(seen.masked.sum()) / masked / it.batch.share.weight) if it.batch.share.weight else loss
+
+
+def shows(it: Iteration) -> Tensor:
+    """Return a boolean mask (n, H, W): where the masks of an iteration's photographs would show the object.
+
+    Masks by a threshold show only the bright part of the object, all others all of it.
+    """
+    seen, threshold = it.observation, it.context.capture.threshold
+    if threshold is None:
+        return torch.ones_like(seen.mask, dtype=torch.bool)
+    return torch.maximum(seen.rgb, it.prediction.rgb.detach()).amax(-1) > threshold
+
+
+def doubt(it: Iteration) -> float:
+    """Return the difference between silhouette and mask above which a mask is probably wrong, see `mask_loss`.
+
+    In a lit room a mask may, for example, contain a shadow. So large differences count less there in the second half of
+    the fit.
+    """
+    return DOUBT if it.context.capture.lit_room and it.progress > SETTLED else math.inf
 
 
 def velocity(it: Iteration) -> Tensor | None:

@@ -161,7 +161,7 @@ def fit_findings(
         if np.hypot(*shift) > max(ALL_SHIFTED * pixel, 3 * scatter / math.sqrt(len(shifts))):
             found.append(f"The photographs are shifted against their predictions, {sides(*shift)} (median): masks or "
                          "cameras may be wrong. If cameras were measured, check cx and cy: the first pixel's centre is "
-                         "at (0.5, 0.5). Otherwise try --refine auto cameras.")  # fmt: skip
+                         "at (0.5, 0.5). Otherwise try --refine auto principal.")  # fmt: skip
         away = [(name, np.subtract(by, shift)) for name, by in shifts]
         limit = max(SHIFTED * pixel, 3 * scatter)
         if few := worst((-np.hypot(*by), name, sides(*by)) for name, by in away if np.hypot(*by) > limit):

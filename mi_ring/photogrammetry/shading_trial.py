@@ -49,6 +49,6 @@ def shading_silhouettes(views: Views, center: np.ndarray, radius: float, progres
     fit = Fit(capture, SETTINGS)
     for _ in progress(fit, "a trial fit", fit.iterations):
         pass
-    surface = fit.renderer.show(fit.model, SETTINGS.subdivisions)
-    drawn = (prediction.draw(surface, capture.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
+    surface, seen = fit.renderer.show(fit.model, SETTINGS.subdivisions), fit.calibrated()
+    drawn = (prediction.draw(surface, seen.photograph(k), spp=4, shadows=False)[1] for k in range(len(views)))
     return [(coverage[0].numpy() > 0.5).astype(np.uint8) for coverage in drawn]
