@@ -24,6 +24,8 @@ DOUBT = 0.03
 BESIDE_FLASH = 2  #: order of the harmonics of a room beside a flash: photographs tell hardly more
 FINE = 0.3  #: progress from which the only light has its full order
 SHARPNESS = 4.0, 3000.0  #: least and largest sharpness of a lobe: a wider one is for harmonics
+GRAZING = 0.15  #: cosine between normal and direction to the camera below which rims no longer become brighter
+RIDGE_OF_MATERIAL = 1e-6  #: relative to the diagonal, where a photograph shows too few pixels
 OF_LOBES = "toward", "log_sharpness", "flux", "in_camera", "count"  #: tensors that describe the lobes
 LOBE_RIDGE = 1e-3  #: ridge of a lobe's flux toward 0, relative to its own diagonal of the normal equations
 
@@ -129,7 +131,7 @@ class RoomLight(nn.Module):
     @torch.no_grad()
     def solve(
         self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
-        total: Callable[[Tensor], Tensor] = lambda equations: equations,
+        total: Callable[[Tensor], Tensor] = lambda equations: equations, facing: Tensor | None = None,
     ) -> None:  # fmt: skip
         """Add photographs to the normal equations, solve them, and set the harmonics to the solution.
 
@@ -137,10 +139,11 @@ class RoomLight(nn.Module):
         linear radiance. `predicted` must contain the current room light, reflected once; its harmonics without
         occlusion. `counted` (N, H, W) bool: True where a pixel shows only the object. `progress` of the fit, 0 to 1: a
         room without other light has its finest harmonics only later in the fit. `total`: returns the sum of a tensor
-        over all processes; default: one process.
+        over all processes; default: one process. `facing` (N, H, W): cosines between the surface's normals and the
+        directions to the camera, if photographs have flashes, whose light on this material may be predicted wrongly.
         """
         which = [k for k in around.rows if k < len(self.vector[0])]  # without lobes beside a flash
-        sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted), 1))
+        sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted, facing), 1))
         if not bool(sums.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
             return
         self.matrix *= MEMORY
@@ -153,12 +156,14 @@ class RoomLight(nn.Module):
         self.update(progress)
 
     def equations(
-        self, around: GlobalIllumination, count: int, predicted: Tensor, observed: Tensor, counted: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        self, around: GlobalIllumination, count: int, predicted: Tensor, observed: Tensor, counted: Tensor,
+        facing: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         """Compute the normal equations of photographs for J = `count` strengths, the first of `around`.
 
-        Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The other arguments are
-        those of `solve`.
+        With `facing`, the material is unknown, see `without_material`: it has learnt to explain the room's light before
+        the room is solved for. Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The
+        other arguments are those of `solve`.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:
@@ -183,9 +188,14 @@ class RoomLight(nn.Module):
         scale = seen.mean(-1) + DIM * self.exposure
         left = missing - torch.einsum("jnc,jc->nc", basis, now[:count])
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
+        shown = torch.einsum("jnc,nc,n->cj", torch.cat([basis, seen[None]]), seen, weight)
+        if facing is not None:
+            photograph, cosine = inside.nonzero()[:, 0], small(facing[..., None])[inside][:, 0]
+            both = torch.cat([basis, missing[None]])
+            both = without_material(both, seen - missing, cosine, photograph, weight)
+            basis, missing = both[:-1], both[-1]
         matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
-        shown = torch.einsum("jnc,nc,n->cj", torch.cat([basis, seen[None]]), seen, weight)
         return matrix.flatten(1), vector, shown
 
     def update(self, progress: float) -> None:
@@ -259,3 +269,25 @@ class RoomLight(nn.Module):
         if self.alone or self.given.any():
             return self.harmonics.new_zeros(3)
         return torch.where(self.shown[:, 0] > 0, DOUBT * self.shown[:, -1] / self.shown[:, 0], 0.0)
+
+
+def without_material(pictures: Tensor, lit: Tensor, facing: Tensor, photograph: Tensor, weight: Tensor) -> Tensor:
+    """Remove from pictures (J, n, 3) what another material, or another power of the flash, could explain.
+
+    For each photograph and colour, least squares remove the multiples of two pictures: `lit` (n, 3), the object by its
+    flash alone, and the same with the rims of a rough matte surface ("Generalization of Lambert's reflectance model",
+    Oren and Nayar 1994). `facing` (n,): cosines between normals and directions to the camera. `photograph` (n,): number
+    of the photograph of each pixel. `weight` (n,) of the pixels.
+    """
+    cosine = facing.clamp(GRAZING, 1)
+    columns = torch.stack([lit, lit * ((1 - cosine**2) / cosine)[:, None]], -1)  # (n, 3, 2)
+    result = pictures.clone()
+    for number in photograph.unique():
+        own = photograph == number
+        used, weights = columns[own], weight[own]
+        matrix = torch.einsum("nca,ncb,n->cab", used, used, weights)
+        small = RIDGE_OF_MATERIAL * matrix.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] + 1e-12
+        right = torch.einsum("nca,jnc,n->caj", used, pictures[:, own], weights)
+        factors = torch.linalg.solve(matrix + small * torch.eye(2).to(matrix), right)
+        result[:, own] -= torch.einsum("nca,caj->jnc", used, factors)
+    return result

@@ -78,7 +78,7 @@ class BrightnessSolver(torch.optim.Optimizer):
         slopes = contrast_slope(predicted, rig.response, index, directions[..., 2:])
         sideways = torch.zeros(*pixels.shape, 2)
         if {"falloff", "light"} <= {*self.calibration.unknowns}:
-            sideways = flash_slope(self.calibration, index, directions, it.prediction.normals())
+            sideways = flash_slope(self.calibration, index, directions, it.prediction.normals)
         bright = torch.minimum(observed, predicted) > BLACK * it.context.exposure
         found = torch.zeros(len(index), COLUMNS + 1, COLUMNS + 1)
         for n, inside in enumerate(pixels):

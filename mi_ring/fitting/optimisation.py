@@ -93,7 +93,12 @@ def solve_room(calibration: Calibration, it: Iteration) -> None:
     pixels = it.object_pixels() & ~seen.clipped.any(-1)
     pixels &= torch.from_numpy(telling[batch.photographs]).to(pixels.device)[:, None, None]
     observed = calibration.linear(seen.rgb, batch.photographs, batch.scale)
-    calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum)
+    facing = None
+    if not calibration.room.alone:
+        rays = calibration.directions(batch.photographs, batch.scale)
+        rays = torch.einsum("nij,nhwj->nhwi", calibration().cameras[batch.photographs, :, :3].detach(), rays)
+        facing = -(it.prediction.normals * rays).sum(-1).to(pixels.device)
+    calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum, facing)
 
 
 class Optimisation:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -44,10 +45,11 @@ class Prediction:
         return replace(self, vertices=self.vertices.detach(), rgb=self.rgb.detach(), coverage=self.coverage.detach(),
                        material={name: value.detach() for name, value in self.material.items()})  # fmt: skip
 
+    @cached_property
     def normals(self) -> Tensor:
-        """Render the unit normals (n, H, W, 3) in the axes of the world. Pixels without a surface are 0.
+        """The unit normals (n, H, W, 3) in the axes of the world. Pixels without a surface are 0.
 
-        Call it before the surface is written again, that is, in the same iteration.
+        They are rendered when they are first read, which must be before the surface is written again.
         """
         return torch.from_numpy(prediction.maps(self.surface, self.photographs, ())["normal"])
 
