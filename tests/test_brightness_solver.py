@@ -81,7 +81,7 @@ def solved(fit, picture, photographed, inside, rounds=40, noise=0.1, looks=0):
         seen = Observation((photographed * error)[..., None].expand(-1, -1, -1, 3), clipped, inside,
                            torch.ones(len(INDEX)).bool(), None)  # fmt: skip
         prediction = SimpleNamespace(rgb=shown[..., None].expand(-1, -1, -1, 3), coverage=inside,
-                                     normals=lambda: in_world(fit, balls(fit, 0.4)))  # fmt: skip
+                                     normals=in_world(fit, balls(fit, 0.4)))  # fmt: skip
         solver.look(Iteration(batch, seen, prediction, fit.context()))
         solver.step()
     return solver.numbers().numpy()
