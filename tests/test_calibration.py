@@ -683,6 +683,19 @@ def test_a_fit_says_what_photographs_that_are_kept_out_say(small_capture, tmp_pa
         assert len(lit) == (10 if "power" in refine else 0) and not {"002", "007"} & set(lit)
 
 
+def test_cameras_are_refined_if_enough_of_them_differ(small_capture):
+    """Not where one camera took several photographs under different lights, nor of fewer than ten."""
+    capture = mi_ring.load_capture(small_capture)
+    first = capture.shots[0].camera
+    same = [replace(shot, camera=first) if k in (3, 5) else shot for k, shot in enumerate(capture.shots)]
+    for of, refined in (
+        (capture, True), (capture.part(np.arange(10)), True), (capture.part(np.arange(9)), False),
+        (replace(capture, shots=tuple(same)), False),
+    ):  # fmt: skip
+        fitted = Fit(of, Config(refine=("auto",), domain="sphere")).model.calibration
+        assert ("cameras" in fitted.refined) == refined
+
+
 def test_scenes_that_are_calibrated_are_left_alone_unless_told_otherwise(small_capture, tmp_path):
     def declare(element):
         ElementTree.SubElement(element, "boolean", name="calibrated", value="true")

@@ -83,7 +83,7 @@ def test_resume_refuses_other_settings_and_missing_checkpoints(finished, small_c
         )
     state = torch.load(finished / "checkpoint.pt", weights_only=False)
     files.write_state(state | {"format": state["format"] - 1}, tmp_path / "checkpoint.pt")
-    with pytest.raises(InputError, match="checkpoint.pt: is a checkpoint of format 7, mi_ring .* goes on from 8"):
+    with pytest.raises(InputError, match="checkpoint.pt: is a checkpoint of format 8, mi_ring .* goes on from 9"):
         fit.main([str(small_capture), "--out", str(tmp_path), "--resume"])
     (tmp_path / "checkpoint.pt").write_bytes(b"PK")
     with pytest.raises(InputError, match="checkpoint.pt: not a checkpoint"):

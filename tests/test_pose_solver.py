@@ -16,7 +16,7 @@ from mi_ring.capture.capture import Observation
 from mi_ring.fitting import losses, pose_solver
 from mi_ring.fitting.exposure_solver import ExposureSolver, quarters, shared_part
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.pose_solver import Pull, motion, pull, shifts_left, slopes
+from mi_ring.fitting.pose_solver import Pull, derivatives, motion, pull, shifts_left, slopes
 from mi_ring.fitting.processes import ALONE
 from mi_ring.fitting.schedule import Stage
 from mi_ring.geometry.camera import Camera
@@ -98,14 +98,14 @@ def test_right_cameras_stay(small_capture):
     assert calibration.turn.abs().max() < 0.25 and calibration.move.abs().max() < 0.25
 
 
-@pytest.mark.parametrize("kind", ["colours", "silhouettes", "both"])
-def test_curvature_is_that_of_the_loss(small_capture, kind):
+@pytest.mark.parametrize("kind", ["colours", "silhouettes", "both", "partly valid"])
+def test_curvature_and_shifts_are_those_of_the_loss(small_capture, kind):
     """Second differences of the loss of pictures that move as a sphere's do: of squares, Gauss-Newton is exact."""
     capture, radius = mi_ring.load_capture(small_capture, images=False), 25.0
     rig = Rig(capture, np.array([400.0, -150.0, 90.0]), 0.3)
     calibration, index = Calibration(capture, ["cameras"], rig), np.array([3, 8])
     weights = {"rgb": 1.0, "mask": 2.0, "calibration": 0.5}
-    weights |= {"colours": {"mask": 0.0}, "silhouettes": {"rgb": 0.0}, "both": {}}[kind]
+    weights |= {"colours": {"mask": 0.0}, "silhouettes": {"rgb": 0.0}}.get(kind, {})
     width, height = capture.shots[0].size
     context = SimpleNamespace(model=SimpleNamespace(calibration=calibration, ring=SimpleNamespace(radius=radius)),
                               config=mi_ring.Config(loss="l2"), exposure=0.3,
@@ -126,7 +126,7 @@ def test_curvature_is_that_of_the_loss(small_capture, kind):
         rgb, coverage = pictures(shift)
         same = torch.zeros_like(rgb, dtype=torch.bool)
         value = weights["rgb"] * losses.rgb_loss(rgb, seen.rgb, same, 0.3, "l2")
-        value = value + weights["mask"] * losses.mask_loss(coverage, seen.mask, 1.5)
+        value = value + weights["mask"] * losses.mask_loss(coverage, seen.mask, 1.5, valid)
         return float(value) + weights["calibration"] * float(2 * step.square().sum()) / 2 / len(rig)
 
     unit = torch.tensor([calibration.widths["turn"]] * 3 + [rig.distance * calibration.widths["move"]] * 3)
@@ -139,8 +139,11 @@ def test_curvature_is_that_of_the_loss(small_capture, kind):
     rgb, coverage = pictures(torch.zeros(2, height, width, 2).double())
     seen = Observation(rgb, torch.zeros_like(rgb, dtype=torch.bool), coverage, torch.ones(2).bool(), None)
     shown = SimpleNamespace(rgb=rgb.float(), coverage=coverage.float())
-    as_seen = seen._replace(rgb=shown.rgb, mask=shown.coverage)
+    valid = torch.ones(2, height, width, dtype=torch.bool)
+    valid[:, :13, 24:40] = kind != "partly valid"  # a part of the outline, where masks are wrong
+    as_seen = seen._replace(rgb=shown.rgb, mask=torch.where(valid, shown.coverage, 1), valid=valid)
     it = Iteration(batch, as_seen, shown, context, weights=weights)
+    assert all(float(first.abs().max()) < 1e-9 for _, first, _ in derivatives(it))
     found = pull(it).curvature.double().sum(0)  # both cameras take the same step
     random = torch.Generator().manual_seed(2)
     for direction in [*torch.eye(6), *torch.randn(6, 6, generator=random)]:
@@ -148,6 +151,11 @@ def test_curvature_is_that_of_the_loss(small_capture, kind):
         second = (loss(step) + loss(-step) - 2 * loss(0 * step)) / 0.1**2
         direction = direction.double()
         assert float(direction @ found @ direction) == pytest.approx(second, rel=0.05), direction
+    right, down = 0.2, -0.1
+    rgb, coverage = pictures(torch.tensor([-right, -down]).double().expand(2, height, width, 2))
+    it.observation = as_seen._replace(rgb=rgb.float(), mask=torch.where(valid, coverage.float(), 1))
+    shifts = pull(it).shifts[:, 0] * views.intrinsics[index, :2]
+    np.testing.assert_allclose(shifts, [[right, down]] * 2, atol=0.02)
 
 
 def test_shifts_are_found_of_pictures_and_of_their_quarters():

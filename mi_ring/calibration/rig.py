@@ -122,10 +122,14 @@ class Rig:
         return int({"camera": self.camera, "lens": self.lens, "light": self.place}[per].max()) + 1
 
     @property
+    def beside_lens(self) -> bool:
+        """True if the photographs' own lights are one flash beside the lens."""
+        return self.flash is not None and float(self.upright[:2].norm()) < BESIDE * self.distance
+
+    @property
     def open_cone(self) -> bool:
         """True if the lights are one flash beside the lens, and the capture does not tell its cone."""
-        beside = float(self.upright[:2].norm()) < BESIDE * self.distance
-        return self.flash is not None and beside and not self.views.cone[self.mainly].any()
+        return self.beside_lens and not self.views.cone[self.mainly].any()
 
     @property
     def turned(self) -> bool:

@@ -25,7 +25,7 @@ BESIDE_FLASH = 2  #: order of the harmonics of a room beside a flash: photograph
 FINE = 0.3  #: progress from which the only light has its full order
 SHARPNESS = 4.0, 3000.0  #: least and largest sharpness of a lobe: a wider one is for harmonics
 GRAZING = 0.15  #: cosine between normal and direction to the camera below which rims no longer become brighter
-RIDGE_OF_MATERIAL = 1e-6  #: relative to the diagonal, where a photograph shows too few pixels
+RIDGE_OF_MATERIAL = 1e-6  #: relative to the trace: a photograph may show too few pixels
 OF_LOBES = "toward", "log_sharpness", "flux", "in_camera", "count"  #: tensors that describe the lobes
 LOBE_RIDGE = 1e-3  #: ridge of a lobe's flux toward 0, relative to its own diagonal of the normal equations
 
@@ -140,7 +140,8 @@ class RoomLight(nn.Module):
         occlusion. `counted` (N, H, W) bool: True where a pixel shows only the object. `progress` of the fit, 0 to 1: a
         room without other light has its finest harmonics only later in the fit. `total`: returns the sum of a tensor
         over all processes; default: one process. `facing` (N, H, W): cosines between the surface's normals and the
-        directions to the camera, if photographs have flashes, whose light on this material may be predicted wrongly.
+        directions to the camera, if the only other light is a flash beside the lens. The solution then finds the power
+        of each photograph and the rims of a rough material, too; see `without_material`.
         """
         which = [k for k in around.rows if k < len(self.vector[0])]  # without lobes beside a flash
         sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted, facing), 1))
@@ -161,8 +162,7 @@ class RoomLight(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         """Compute the normal equations of photographs for J = `count` strengths, the first of `around`.
 
-        With `facing`, the material is unknown, see `without_material`: it has learnt to explain the room's light before
-        the room is solved for. Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The
+        Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The
         other arguments are those of `solve`.
         """
 
@@ -274,10 +274,12 @@ class RoomLight(nn.Module):
 def without_material(pictures: Tensor, lit: Tensor, facing: Tensor, photograph: Tensor, weight: Tensor) -> Tensor:
     """Remove from pictures (J, n, 3) what another material, or another power of the flash, could explain.
 
-    For each photograph and colour, least squares remove the multiples of two pictures: `lit` (n, 3), the object by its
-    flash alone, and the same with the rims of a rough matte surface ("Generalization of Lambert's reflectance model",
-    Oren and Nayar 1994). `facing` (n,): cosines between normals and directions to the camera. `photograph` (n,): number
-    of the photograph of each pixel. `weight` (n,) of the pixels.
+    The material takes a room's light for its own before the room is solved for: at first, nothing else explains it.
+
+    For each photograph and colour, least squares remove the multiples of two pictures: `lit` (n, 3), the object without
+    room, and the same with the rims of a rough matte surface ("Generalization of Lambert's reflectance model", Oren and
+    Nayar 1994), for light from the camera. `facing` (n,): cosines between normals and directions to the camera.
+    `photograph` (n,): number of the photograph of each pixel. `weight` (n,) of the pixels.
     """
     cosine = facing.clamp(GRAZING, 1)
     columns = torch.stack([lit, lit * ((1 - cosine**2) / cosine)[:, None]], -1)  # (n, 3, 2)
@@ -286,8 +288,8 @@ def without_material(pictures: Tensor, lit: Tensor, facing: Tensor, photograph: 
         own = photograph == number
         used, weights = columns[own], weight[own]
         matrix = torch.einsum("nca,ncb,n->cab", used, used, weights)
-        small = RIDGE_OF_MATERIAL * matrix.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] + 1e-12
+        ridge = RIDGE_OF_MATERIAL * matrix.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] + 1e-12
         right = torch.einsum("nca,jnc,n->caj", used, pictures[:, own], weights)
-        factors = torch.linalg.solve(matrix + small * torch.eye(2).to(matrix), right)
+        factors = torch.linalg.solve(matrix + ridge * torch.eye(2).to(matrix), right)
         result[:, own] -= torch.einsum("nca,caj->jnc", used, factors)
     return result

@@ -48,8 +48,9 @@ class Common:
     refine: tuple[Unknown, ...] = ("auto",)
     """Calibration that the fit corrects, in addition to surface and material. Initial values come from the scene file.
     auto: light, power, ambient. Also scale, if with these lights the object would reflect more light than it gets.
-    From ten photographs on also cameras; falloff, if the lights are a flash beside the lens, whose cone the scene file
-    does not give, but not with vignetting; contrast, if the photographs' curve is not given, as in most sRGB files.
+    From ten photographs on also cameras, if they differ; falloff, if the lights are a flash beside the lens, whose cone
+    the scene file does not give, but not with vignetting; contrast, if the photographs' curve is not given, as in most
+    sRGB files.
     With another --light than capture, auto is gain and ambient; for lamps also light and lamps.
     none: nothing, for exact calibration. If predicted photographs look shifted, give --refine auto principal.
     cameras: position and direction of each camera.

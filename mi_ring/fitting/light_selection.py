@@ -216,8 +216,8 @@ class CoarseFits:
 def refined_under(lighting: Lighting, config: Config) -> tuple[Any, ...]:
     """List the options of `--refine` for a coarse fit under `lighting`. `config`: settings of the real fit.
 
-    From the options of the real fit, these are kept: `auto`, the camera response, and the lights if they are those of
-    the scene. There, `auto` also corrects cameras: the scene's lights would otherwise be blamed for wrong poses.
+    From the options of the real fit, these are kept: `auto`, `gain`, the camera response, and the lights if they are
+    those of the scene. With the scene's lights, `auto` also corrects cameras.
     """
     own = {*OWN_LIGHTS, "ambient"} if lighting.kind == "capture" else set()
     return tuple(name for name in config.refine if name in {"auto", "gain", *RECORDING, *own}) or ("none",)

@@ -25,6 +25,7 @@ from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
 from mi_ring.fitting.small_lights import find_lobes
 from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import has_fast_bfloat16
 
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
@@ -93,11 +94,12 @@ def solve_room(calibration: Calibration, it: Iteration) -> None:
     pixels = it.object_pixels() & ~seen.clipped.any(-1)
     pixels &= torch.from_numpy(telling[batch.photographs]).to(pixels.device)[:, None, None]
     observed = calibration.linear(seen.rgb, batch.photographs, batch.scale)
-    facing = None
-    if not calibration.room.alone:
+    facing, rig = None, calibration.rig
+    if rig.beside_lens and rig.lit.all() and not shared_emitters(it.context.capture.scene):
         rays = calibration.directions(batch.photographs, batch.scale)
-        rays = torch.einsum("nij,nhwj->nhwi", calibration().cameras[batch.photographs, :, :3].detach(), rays)
+        rays = torch.einsum("nij,nhwj->nhwi", calibration().cameras[batch.photographs, :, :3], rays)
         facing = -(it.prediction.normals * rays).sum(-1).to(pixels.device)
+        pixels &= facing.isfinite()
     calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum, facing)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mi_ring.calibration.calibration import Calibration
-from mi_ring.fitting.exposure_solver import quarters, shared_part
+from mi_ring.fitting.exposure_solver import SEVERAL, quarters, shared_part
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.losses import colour_error, perceived
 from mi_ring.fitting.schedule import Rate
@@ -104,14 +104,19 @@ class PoseSolver(torch.optim.Optimizer):
 
     @property
     def measured(self) -> Tensor:
-        """(cameras, 5, 2): the shifts in the last picture seen of each camera, see `Pull`; 0: unknown."""
+        """(cameras, 5, 2): the last shifts that were told of each camera, see `Pull`; 0: none was."""
         (group,) = self.param_groups
         return self.state[group["params"][0]]["measured"]
 
     @property
     def shared(self) -> float:
-        """How much of the variance of shifts, in both directions, the quarters have in common, 0 to 1."""
+        """How much of the variance of shifts, in both directions, the quarters have in common, 0 to 1.
+
+        It is 0 as long as the pictures of fewer than four cameras tell it, and 1 if there are fewer cameras.
+        """
         known = (self.measured != 0).all(1, keepdim=True)
+        if known.sum() < SEVERAL:
+            return float(2 * len(known) < SEVERAL)
         mean = (known * self.measured).sum(0) / known.sum(0).clamp(min=1)
         centred = torch.where(known, self.measured - mean, 0)
         return float(shared_part(torch.cat(centred.unbind(-1))[..., None]))
@@ -204,6 +209,8 @@ def derivatives(it: Iteration) -> Iterator[tuple[tuple[int, int], Tensor, Tensor
     colour_weight = it.weights.get("rgb", 0.0) / (len(it.batch.all_photographs) * error[0].numel())
     masked = max(1.0, float(it.batch.share.sum(seen.masked.sum())))
     mask_weight = 2 * it.weights.get("mask", 0.0) / (masked * seen.mask[0].numel())
+    shown = shows(it)
+    valid = torch.ones_like(shown) if seen.valid is None else seen.valid
     for i in range(len(error)):
         left, top, box = object_box(prediction.coverage[i], 3 * sigma)
         weight = 2 * torch.ones_like(size[i][box]) if kind == "l2" else 1 / size[i][box].maximum(least)
@@ -214,10 +221,10 @@ def derivatives(it: Iteration) -> Iterator[tuple[tuple[int, int], Tensor, Tensor
         first = torch.einsum("hwc,hwc,hwca->hwa", weight, error[i][box], colour)
         second = torch.einsum("hwc,hwca,hwcb->hwab", weight, colour, colour)
         if seen.masked[i] and mask_weight:
-            shown = shows(it)[i][box] if seen.valid is None else (shows(it) & seen.valid)[i][box]
-            coverage = prediction.coverage[i][box]
-            outline = blur(shown * slopes(coverage[..., None])[..., 0, :].movedim(-1, 0), sigma).movedim(0, -1)
-            off = blur(torch.where(shown, coverage, 0) - seen.mask[i][box], sigma)
+            coverage = torch.where(shown[i], prediction.coverage[i], 0)[box]
+            outline = slopes(prediction.coverage[i][box][..., None])[..., 0, :].movedim(-1, 0)
+            outline = blur((shown & valid)[i][box] * outline, sigma).movedim(0, -1)
+            off = blur(valid[i][box] * (coverage - seen.mask[i][box]), sigma)
             trusted = mask_weight / (1 + off.square() / doubt(it) ** 2).square()
             first = first + (trusted * off)[..., None] * outline
             second = second + trusted[..., None, None] * torch.einsum("hwa,hwb->hwab", outline, outline)

@@ -72,7 +72,7 @@ class Refinement(NamedTuple):
 
 
 def moves_alone(capture: Capture) -> bool:
-    """Test whether a capture has enough cameras, none of which is also that of a photograph under another light."""
+    """Test whether a capture has enough cameras that differ from each other, except those of pairs."""
     cameras = {shot.camera.to_world.tobytes() for shot in capture.shots}
     return len(cameras) >= FEWEST and len(cameras) == len({*camera_numbers(capture).tolist()})
 

@@ -42,8 +42,11 @@ class Prediction:
 
     def detached(self) -> "Prediction":
         """Return a copy without gradients. It does not hold the autograd graph, which uses much memory."""
-        return replace(self, vertices=self.vertices.detach(), rgb=self.rgb.detach(), coverage=self.coverage.detach(),
-                       material={name: value.detach() for name, value in self.material.items()})  # fmt: skip
+        result = replace(self, vertices=self.vertices.detach(), rgb=self.rgb.detach(), coverage=self.coverage.detach(),
+                         material={name: value.detach() for name, value in self.material.items()})  # fmt: skip
+        if "normals" in vars(self):
+            vars(result)["normals"] = self.normals  # the surface may be written before they are read again
+        return result
 
     @cached_property
     def normals(self) -> Tensor:
