@@ -24,8 +24,7 @@ DOUBT = 0.03
 BESIDE_FLASH = 2  #: order of the harmonics of a room beside a flash: photographs tell hardly more
 FINE = 0.3  #: progress from which the only light has its full order
 SHARPNESS = 4.0, 3000.0  #: least and largest sharpness of a lobe: a wider one is for harmonics
-GRAZING = 0.15  #: cosine between normal and direction to the camera below which rims no longer become brighter
-RIDGE_OF_MATERIAL = 1e-6  #: relative to the trace: a photograph may show too few pixels
+RIDGE_OF_FLASH = 1e-6  #: relative to the trace: a photograph may show too few pixels
 OF_LOBES = "toward", "log_sharpness", "flux", "in_camera", "count"  #: tensors that describe the lobes
 LOBE_RIDGE = 1e-3  #: ridge of a lobe's flux toward 0, relative to its own diagonal of the normal equations
 
@@ -131,7 +130,7 @@ class RoomLight(nn.Module):
     @torch.no_grad()
     def solve(
         self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
-        total: Callable[[Tensor], Tensor] = lambda equations: equations, facing: Tensor | None = None,
+        total: Callable[[Tensor], Tensor] = lambda equations: equations, changes: Tensor | None = None,
     ) -> None:  # fmt: skip
         """Add photographs to the normal equations, solve them, and set the harmonics to the solution.
 
@@ -139,12 +138,11 @@ class RoomLight(nn.Module):
         linear radiance. `predicted` must contain the current room light, reflected once; its harmonics without
         occlusion. `counted` (N, H, W) bool: True where a pixel shows only the object. `progress` of the fit, 0 to 1: a
         room without other light has its finest harmonics only later in the fit. `total`: returns the sum of a tensor
-        over all processes; default: one process. `facing` (N, H, W): cosines between the surface's normals and the
-        directions to the camera, if the only other light is a flash beside the lens. The solution then finds the power
-        of each photograph and the rims of a rough material, too; see `without_material`.
+        over all processes; default: one process. `changes` (N, H, W, K): if the only other light is a flash at
+        the lens, how it may differ from the prediction, relative to it; see `without_flash`.
         """
         which = [k for k in around.rows if k < len(self.vector[0])]  # without lobes beside a flash
-        sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted, facing), 1))
+        sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted, changes), 1))
         if not bool(sums.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
             return
         self.matrix *= MEMORY
@@ -158,7 +156,7 @@ class RoomLight(nn.Module):
 
     def equations(
         self, around: GlobalIllumination, count: int, predicted: Tensor, observed: Tensor, counted: Tensor,
-        facing: Tensor | None = None,
+        changes: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         """Compute the normal equations of photographs for J = `count` strengths, the first of `around`.
 
@@ -189,10 +187,9 @@ class RoomLight(nn.Module):
         left = missing - torch.einsum("jnc,jc->nc", basis, now[:count])
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
         shown = torch.einsum("jnc,nc,n->cj", torch.cat([basis, seen[None]]), seen, weight)
-        if facing is not None:
-            photograph, cosine = inside.nonzero()[:, 0], small(facing[..., None])[inside][:, 0]
-            both = torch.cat([basis, missing[None]])
-            both = without_material(both, seen - missing, cosine, photograph, weight)
+        if changes is not None:
+            both, photograph = torch.cat([basis, missing[None]]), inside.nonzero()[:, 0]
+            both = without_flash(both, seen - missing, small(changes)[inside], photograph, weight)
             basis, missing = both[:-1], both[-1]
         matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
@@ -271,25 +268,25 @@ class RoomLight(nn.Module):
         return torch.where(self.shown[:, 0] > 0, DOUBT * self.shown[:, -1] / self.shown[:, 0], 0.0)
 
 
-def without_material(pictures: Tensor, lit: Tensor, facing: Tensor, photograph: Tensor, weight: Tensor) -> Tensor:
-    """Remove from pictures (J, n, 3) what another material, or another power of the flash, could explain.
+def without_flash(pictures: Tensor, lit: Tensor, changes: Tensor, photograph: Tensor, weight: Tensor) -> Tensor:
+    """Remove from pictures (J, n, 3) what another material or another flash could explain.
 
-    The material takes a room's light for its own before the room is solved for: at first, nothing else explains it.
+    These take a room's light for their own before the room is solved for: at first, nothing else explains it.
 
-    For each photograph and colour, least squares remove the multiples of two pictures: `lit` (n, 3), the object without
-    room, and the same with the rims of a rough matte surface ("Generalization of Lambert's reflectance model", Oren and
-    Nayar 1994), for light from the camera. `facing` (n,): cosines between normals and directions to the camera.
-    `photograph` (n,): number of the photograph of each pixel. `weight` (n,) of the pixels.
+    For each photograph and colour, least squares remove the multiples of `lit` (n, 3), the object without room, and of
+    its products with `changes` (n, K) and with its own logarithm, as for another curve of the camera. `photograph`
+    (n,): number of the photograph of each pixel. `weight` (n,) of the pixels.
     """
-    cosine = facing.clamp(GRAZING, 1)
-    columns = torch.stack([lit, lit * ((1 - cosine**2) / cosine)[:, None]], -1)  # (n, 3, 2)
+    bright = lit.clamp(min=1e-6 * float(lit.abs().mean()) + 1e-12)
+    columns = torch.stack([lit, lit * bright.log(), *(lit * change[:, None] for change in changes.T)], -1)
     result = pictures.clone()
     for number in photograph.unique():
         own = photograph == number
         used, weights = columns[own], weight[own]
+        used = used / used.square().mean(0).sqrt().clamp(min=1e-12)
         matrix = torch.einsum("nca,ncb,n->cab", used, used, weights)
-        ridge = RIDGE_OF_MATERIAL * matrix.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] + 1e-12
+        ridge = RIDGE_OF_FLASH * matrix.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] + 1e-12
         right = torch.einsum("nca,jnc,n->caj", used, pictures[:, own], weights)
-        factors = torch.linalg.solve(matrix + ridge * torch.eye(2).to(matrix), right)
+        factors = torch.linalg.solve(matrix + ridge * torch.eye(used.shape[-1]).to(matrix), right)
         result[:, own] -= torch.einsum("nca,caj->jnc", used, factors)
     return result

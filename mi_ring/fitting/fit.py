@@ -70,8 +70,7 @@ class Fit(Renamed):
         if state is not None and networks:
             raise InputError("networks: those of the state are taken; give one of the two")
         lighting, ring = (lighting, None) if state is None else restored(state)
-        lighting = lighting or Lighting.of(capture, config)
-        self.problem = problem = Problem.of(capture, config, lighting, self.loss.usual)
+        self.problem = problem = Problem.of(capture, config, lighting or Lighting.of(capture, config), self.loss.usual)
         torch.manual_seed(config.seed)
         self.model = model = Model(problem, (ring or starting_ring(problem, networks)).to(problem.device))
         self.loss.require_velocity(self.ring.shape_net)

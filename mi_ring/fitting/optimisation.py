@@ -31,6 +31,7 @@ from mi_ring.system.machine import has_fast_bfloat16
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
 LOBE_TURN, LOBE_SHARPEN = 0.004, 0.03  #: Adam's learning rates for lobes: of directions [rad], of log sharpness
 TEXTURE_FACTOR = 3.0  #: longest step of a value of a texture, by the longest step of a displacement
+GRAZING = 0.15  #: cosine between normal and direction to the camera below which rims no longer become brighter
 CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one makes it diverge
 
 
@@ -94,13 +95,25 @@ def solve_room(calibration: Calibration, it: Iteration) -> None:
     pixels = it.object_pixels() & ~seen.clipped.any(-1)
     pixels &= torch.from_numpy(telling[batch.photographs]).to(pixels.device)[:, None, None]
     observed = calibration.linear(seen.rgb, batch.photographs, batch.scale)
-    facing, rig = None, calibration.rig
+    changes, rig = None, calibration.rig
     if rig.beside_lens and rig.lit.all() and not shared_emitters(it.context.capture.scene):
         rays = calibration.directions(batch.photographs, batch.scale)
-        rays = torch.einsum("nij,nhwj->nhwi", calibration().cameras[batch.photographs, :, :3], rays)
-        facing = -(it.prediction.normals * rays).sum(-1).to(pixels.device)
-        pixels &= facing.isfinite()
-    calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum, facing)
+        in_world = torch.einsum("nij,nhwj->nhwi", calibration().cameras[batch.photographs, :, :3], rays)
+        changes = flash_changes(-(it.prediction.normals * in_world).sum(-1), rays).to(pixels.device)
+        pixels &= changes.isfinite().all(-1)
+    calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum, changes)
+
+
+def flash_changes(facing: Tensor, rays: Tensor) -> Tensor:
+    """Compute how the light of a flash at the lens may differ from the prediction, relative to it: (N, H, W, 4).
+
+    The rims of a rough matte surface ("Generalization of Lambert's reflectance model", Oren and Nayar 1994), and the
+    flash's cone: its exponent and tilts. `facing` (N, H, W): cosines between normals and directions to the camera.
+    `rays` (N, H, W, 3): unit directions of the pixels in the camera's axes.
+    """
+    facing = facing.clamp(GRAZING, 1)
+    left, up, forward = rays.unbind(-1)
+    return torch.stack([(1 - facing**2) / facing, forward.log(), left, up], -1)
 
 
 class Optimisation:
