@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 import torch
 from helpers.lit_cup import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
+from helpers.quick_fits import iteration_of, posed
 
 from mi_ring.calibration.room_light import RoomLight
 from mi_ring.capture.emitter_elements import room_element, room_elements
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import recalibrated_xml, scene_bytes
+from mi_ring.fitting import optimisation
+from mi_ring.fitting.optimisation import flash_changes
 from mi_ring.rendering import indirect_light
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_photographs
@@ -246,7 +249,7 @@ def test_a_room_takes_no_light_away():
 
 
 def test_a_room_is_found_that_the_material_has_learnt_to_explain():
-    """The predicted flash is brighter by a third, and more so at rims; photographs differ in power."""
+    """The predicted flash is brighter by a third, and more so at rims and to the left; photographs differ in power."""
     random = torch.Generator().manual_seed(2)
 
     def drawn(*shape):
@@ -264,19 +267,42 @@ def test_a_room_is_found_that_the_material_has_learnt_to_explain():
     truth *= 0.3 * flash.mean() / light.mean()
     light *= 0.3 * flash.mean() / light.mean()
     rims = ((1 - facing**2) / facing)[..., None]
-    learnt = flash * (torch.tensor([1.2, 1.4, 1.3])[:, None, None, None] + 0.2 * rims)
+    left = torch.linspace(-0.3, 0.3, 7)[:, None].expand_as(rims)
+    learnt = flash * (torch.tensor([1.2, 1.4, 1.3])[:, None, None, None] + 0.2 * rims + left)
 
     def whole(picture):
         return picture.repeat_interleave(2, 1).repeat_interleave(2, 2)
 
     found = []
-    for cosines in (None, whole(facing[..., None])[..., 0]):
+    for changes in (None, whole(torch.cat([rims, left], -1))):
         room = RoomLight(torch.zeros(BASIS, 3), 0.3)
         everywhere = torch.ones(count, 10, 14) > 0
-        room.solve(around, whole(learnt), whole(flash + light), everywhere, facing=cosines)
+        room.solve(around, whole(learnt), whole(flash + light), everywhere, changes=changes)
         found.append(torch.einsum("jnhwc,jc->nhwc", harmonics, room.harmonics[ALL]))
     assert float((found[0] - light).abs().mean()) > 0.8 * float(light.mean())
     assert float((found[1] - light).abs().mean()) < 0.2 * float(light.mean())
+
+
+def test_changes_of_a_flash_are_those_of_rims_and_of_its_cone():
+    """As the reflectance and the falloff of the renderer say, for a flash at the lens."""
+    facing, rays = torch.tensor([1.0, 0.6, 0.01]), torch.tensor([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.6, 0.8]])
+    found = flash_changes(facing, rays)
+    expected = [[0, 0, 0, 0], [0.64 / 0.6, np.log(0.96), 0.28, 0], [(1 - 0.15**2) / 0.15, np.log(0.8), 0, -0.6]]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_normals_for_the_room_face_the_camera(small_capture, monkeypatch):
+    """In the middle of an ellipsoid by about 1, at its outline by 0, nowhere less."""
+    fit, _ = posed(small_capture, refine=("ambient",))
+    seen = []
+    monkeypatch.setattr(optimisation, "flash_changes", lambda *given: seen.append(given) or flash_changes(*given))
+    fit.step()
+    (facing, rays), coverage = seen[0], iteration_of(fit).prediction.coverage
+    inside = coverage > 0.99
+    assert float(facing[inside].min()) > -0.05 and float(facing[inside].amax()) > 0.97
+    near = torch.nn.functional.max_pool2d(1 - coverage[:, None], 3, 1, 1)[:, 0] > 0.5
+    assert float(facing[inside & near].mean()) < float(facing[inside & ~near].mean()) - 0.2
+    assert float(rays[..., 2].min()) > 0.8
 
 
 def test_a_room_is_believed_by_its_share_and_by_its_colours():
