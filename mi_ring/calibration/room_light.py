@@ -138,8 +138,8 @@ class RoomLight(nn.Module):
         linear radiance. `predicted` must contain the current room light, reflected once; its harmonics without
         occlusion. `counted` (N, H, W) bool: True where a pixel shows only the object. `progress` of the fit, 0 to 1: a
         room without other light has its finest harmonics only later in the fit. `total`: returns the sum of a tensor
-        over all processes; default: one process. `changes` (N, H, W, K): if the only other light is a flash at
-        the lens, how it may differ from the prediction, relative to it; see `without_flash`.
+        over all processes; default: one process. `changes` (N, H, W, K): if the only other light is a flash at the
+        lens, how it may differ from the prediction, relative to it; see `without_flash`.
         """
         which = [k for k in around.rows if k < len(self.vector[0])]  # without lobes beside a flash
         sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted, changes), 1))
@@ -160,8 +160,8 @@ class RoomLight(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         """Compute the normal equations of photographs for J = `count` strengths, the first of `around`.
 
-        Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The
-        other arguments are those of `solve`.
+        Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The other arguments are
+        those of `solve`.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:
