@@ -234,7 +234,8 @@ def test_both_kinds_of_photographs_are_measured(fitted, pairs, tmp_path):
     _, folder = fitted
     numbers = evaluate(folder, pairs.parent / "truth/mesh.ply", spp=4)
     for kind in ("input", "held_out", "room_input", "room_held_out"):
-        assert numbers[f"psnr_{kind}"] > 22, kind  # 23.6 to 24.5, depending on the processor
+        # Held out in the room it is 23.7 to 24.5, by the precision in which processors compute the networks.
+        assert numbers[f"psnr_{kind}"] > (23.5 if kind == "room_held_out" else 24), kind
     render.main([str(folder), str(folder / "scene.xml"), str(tmp_path / "out"), "--spp", "16"])
     for kind in ("images", "ambient"):
         drawn, seen = (read_image(place / kind / "004.exr").astype(float) for place in (tmp_path / "out", pairs.parent))

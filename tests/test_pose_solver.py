@@ -16,7 +16,7 @@ from mi_ring.capture.capture import Observation
 from mi_ring.fitting import losses, pose_solver
 from mi_ring.fitting.exposure_solver import ExposureSolver, quarters, shared_part
 from mi_ring.fitting.iteration import Iteration
-from mi_ring.fitting.pose_solver import Pull, derivatives, motion, pull, shifts_left, slopes
+from mi_ring.fitting.pose_solver import Pull, derivatives, motion, pull, remaining_shifts, slopes
 from mi_ring.fitting.processes import ALONE
 from mi_ring.fitting.schedule import Stage
 from mi_ring.geometry.camera import Camera
@@ -170,19 +170,19 @@ def test_shifts_are_found_of_pictures_and_of_their_quarters():
     shown, slope = picture(0, 0), slopes(picture(0, 0)[..., None])[..., 0, :]
     second = torch.einsum("hwa,hwb->hwab", slope, slope)
     moved, part = picture(0.3, -0.2), (x > 27.5) & (y > 19.5)
-    all_of_it = shifts_left((shown - moved)[..., None] * slope, second, inside)
+    all_of_it = remaining_shifts((shown - moved)[..., None] * slope, second, inside)
     np.testing.assert_allclose(all_of_it, np.tile([[0.3, -0.2]], (5, 1)), atol=0.02)
-    one = shifts_left(((shown - moved) * part)[..., None] * slope, second, inside)
+    one = remaining_shifts(((shown - moved) * part)[..., None] * slope, second, inside)
     np.testing.assert_allclose(one[1:], np.outer([0, 0, 0, 1], [0.3, -0.2]), atol=0.02)
     assert one[0].abs().max() < 0.1
     # A quarter without structure, or with some in one direction alone, tells nothing. Nor does a pixel that is NaN.
     flat = slope.clone()
     flat[..., 1] *= ~((x < 27.5) & (y < 19.5))
     second = torch.einsum("hwa,hwb->hwab", flat, flat)
-    found = shifts_left((shown - moved)[..., None] * flat, second * ~part[..., None, None], inside)
+    found = remaining_shifts((shown - moved)[..., None] * flat, second * ~part[..., None, None], inside)
     assert found.isnan().all(1).tolist() == [False, True, False, False, True]
     second[8, 12] = torch.nan
-    assert shifts_left((shown - moved)[..., None] * flat, second, inside).isnan().all()
+    assert remaining_shifts((shown - moved)[..., None] * flat, second, inside).isnan().all()
 
 
 def test_shifts_that_are_unknown_are_not_stored(small_capture, monkeypatch):

@@ -17,7 +17,7 @@ from mi_ring.capture.emitter_elements import room_element, room_elements
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import recalibrated_xml, scene_bytes
 from mi_ring.fitting import optimisation
-from mi_ring.fitting.optimisation import flash_changes
+from mi_ring.fitting.brightness_solver import flash_changes
 from mi_ring.rendering import indirect_light
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_photographs

@@ -27,6 +27,7 @@ LEAST_TILT = 0.1  #: and at least this
 DOUBT_OF_CONE, DOUBT_OF_CONTRAST = 0.05, 0.01
 RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
 LOOKS = 80  #: number of iterations in which the contrast is solved for: later the material would take it bit by bit
+LEAST_FACING = 0.15  #: cosine between normal and direction to the camera below which rims no longer become brighter
 GRAZING = 0.2  #: cosine between normal and light below which the change of brightness no longer grows
 COLUMNS = 8  #: of `columns`
 CONE, CONTRAST, SHOWN, AWAY, PLACE = [0, 1, 2], [3], [4], [5], [6, 7]  #: numbers of them
@@ -147,6 +148,18 @@ def flash_slope(calibration: Calibration, index: np.ndarray, directions: Tensor,
     facing = torch.einsum("nji,nhwj->nhwi", axes, normals)
     along = (facing * v).sum(-1, keepdim=True).clamp(min=GRAZING)
     return (facing / along - 3 * v / v.square().sum(-1, keepdim=True))[..., :2]
+
+
+def flash_changes(facing: Tensor, rays: Tensor) -> Tensor:
+    """Compute how the light of a flash at the lens may differ from the prediction, relative to it: (N, H, W, 4).
+
+    The rims of a rough matte surface ("Generalization of Lambert's reflectance model", Oren and Nayar 1994), and the
+    flash's cone: its exponent and tilts. `facing` (N, H, W): cosines between normals and directions to the camera.
+    `rays` (N, H, W, 3): unit directions of the pixels in the camera's axes.
+    """
+    facing = facing.clamp(LEAST_FACING, 1)
+    left, up, forward = rays.unbind(-1)
+    return torch.stack([(1 - facing**2) / facing, forward.log(), left, up], -1)
 
 
 def columns(directions: Tensor, sideways: Tensor, held: Tensor, slopes: Tensor, shown: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.errors import InputError
 from mi_ring.fitting.agreeing_adam import AgreeingAdam
-from mi_ring.fitting.brightness_solver import BrightnessSolver
+from mi_ring.fitting.brightness_solver import BrightnessSolver, flash_changes
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import unfold
 from mi_ring.fitting.exposure_solver import ExposureSolver
@@ -31,7 +31,6 @@ from mi_ring.system.machine import has_fast_bfloat16
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
 LOBE_TURN, LOBE_SHARPEN = 0.004, 0.03  #: Adam's learning rates for lobes: of directions [rad], of log sharpness
 TEXTURE_FACTOR = 3.0  #: longest step of a value of a texture, by the longest step of a displacement
-GRAZING = 0.15  #: cosine between normal and direction to the camera below which rims no longer become brighter
 CLIPPED = 1.0  #: norm to which Shape-Net's gradient is clipped: a longer one makes it diverge
 
 
@@ -102,18 +101,6 @@ def solve_room(calibration: Calibration, it: Iteration) -> None:
         changes = flash_changes(-(it.prediction.normals * in_world).sum(-1), rays).to(pixels.device)
         pixels &= changes.isfinite().all(-1)
     calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum, changes)
-
-
-def flash_changes(facing: Tensor, rays: Tensor) -> Tensor:
-    """Compute how the light of a flash at the lens may differ from the prediction, relative to it: (N, H, W, 4).
-
-    The rims of a rough matte surface ("Generalization of Lambert's reflectance model", Oren and Nayar 1994), and the
-    flash's cone: its exponent and tilts. `facing` (N, H, W): cosines between normals and directions to the camera.
-    `rays` (N, H, W, 3): unit directions of the pixels in the camera's axes.
-    """
-    facing = facing.clamp(GRAZING, 1)
-    left, up, forward = rays.unbind(-1)
-    return torch.stack([(1 - facing**2) / facing, forward.log(), left, up], -1)
 
 
 class Optimisation:

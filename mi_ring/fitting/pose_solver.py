@@ -188,7 +188,7 @@ def pull(it: Iteration) -> Pull:
         inside = covered[i, top : top + height, left : left + width]
         if inside.any():
             so_far = (moving[inside] @ poses[rig.camera[k]]).mean(0)
-            shifts[i] = (so_far + shifts_left(first, second, inside)) / intrinsics[:2]
+            shifts[i] = (so_far + remaining_shifts(first, second, inside)) / intrinsics[:2]
     return Pull(matrices, shifts)
 
 
@@ -241,7 +241,7 @@ def object_box(coverage: Tensor, margin: float) -> tuple[int, int, tuple[slice, 
     return columns.start, rows.start, (rows, columns)
 
 
-def shifts_left(first: Tensor, second: Tensor, inside: Tensor) -> Tensor:
+def remaining_shifts(first: Tensor, second: Tensor, inside: Tensor) -> Tensor:
     """Compute by least squares how far a picture is from the photograph, and each quarter of it: (5, 2) [px].
 
     NaN: the quarter has too little structure in one direction, or compared with the whole. `first`, `second`: as

@@ -44,8 +44,7 @@ class Refinement(NamedTuple):
         weak. It is then the factor of all lights that gives the object a usual albedo.
 
         Raises InputError if `falloff` or `contrast` is asked for with fewer than 10 photographs, or `cameras` with
-        terms `rgb` or `mask` of the loss that are not the default ones: the solver of poses has to know how they
-        change with poses.
+        terms `rgb` or `mask` of the loss that are not the default ones: the solver of poses needs their derivatives.
         """
         reflectance = problem.seen.reflectance(center, problem.exposure)
         albedo, capture, config = math.pi * reflectance, problem.capture, problem.config
@@ -55,13 +54,13 @@ class Refinement(NamedTuple):
             raise InputError(f"{capture.path}: --refine {min(asked)}: the fit has {count} photographs with a light of "
                              f"their own, which do not tell it; leave it out, or give at least {FEWEST}")  # fmt: skip
         if "cameras" in config.refine and not problem.usual_loss:
-            raise InputError("terms: rgb, mask: must be the default ones for --refine cameras, which has to know how "
-                             "they change with them; give yours other names")  # fmt: skip
+            raise InputError("terms: rgb, mask: must be the default ones for --refine cameras, which needs their "
+                             "derivatives; give your terms other names")  # fmt: skip
         open_unknowns: set[str] = set()
         if several and "auto" in config.refine and not capture.known:
             open_unknowns |= {"falloff"} if Rig(capture, center, problem.exposure).open_cone else set()
             open_unknowns |= {"contrast"} if has_open_curve(capture.shots) else set()
-            open_unknowns |= {"cameras"} if problem.usual_loss and moves_alone(problem.seen) else set()
+            open_unknowns |= {"cameras"} if problem.usual_loss and cameras_differ(problem.seen) else set()
         refined = refined_of(problem.seen, config, problem.lighting.kind, albedo, open_unknowns)
         return cls(reflectance, refined, albedo / ALBEDO if "scale" in refined and albedo >= 1 else 1.0)
 
@@ -71,8 +70,8 @@ class Refinement(NamedTuple):
         return math.pi * self.reflectance
 
 
-def moves_alone(capture: Capture) -> bool:
-    """Test whether a capture has enough cameras that differ from each other, except those of pairs."""
+def cameras_differ(capture: Capture) -> bool:
+    """Test whether a capture has at least 10 cameras, all different, except that a pair shares one."""
     cameras = {shot.camera.to_world.tobytes() for shot in capture.shots}
     return len(cameras) >= FEWEST and len(cameras) == len({*camera_numbers(capture).tolist()})
 
