@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 import torch
 from helpers.lit_cup import ALBEDO, CENTER, HEIGHT, INTENSITY, WIDTH, cup, load, material, photograph, pictures
-from helpers.quick_fits import iteration_of, posed
 
 from mi_ring.calibration.room_light import RoomLight
 from mi_ring.capture.emitter_elements import room_element, room_elements
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.scenefile import recalibrated_xml, scene_bytes
-from mi_ring.fitting import optimisation
-from mi_ring.fitting.brightness_solver import flash_changes
 from mi_ring.rendering import indirect_light
 from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.image_formation import render_photographs
@@ -215,11 +212,8 @@ def test_without_anything_seen_the_room_is_as_given():
     torch.testing.assert_close(room.harmonics, given)
 
 
-def solved_room(*shares, given=None):
-    """Light of the room that least squares finds, and the true one, in photographs of which it is these shares.
-
-    They are beside the room that is given.
-    """
+def solved_room(*shares):
+    """Light of the room that least squares finds, and the true one, in photographs of which it is these shares."""
     random = torch.Generator().manual_seed(0)
     harmonics = torch.rand(len(ALL), 1, 5, 7, 1, generator=random).expand(-1, -1, -1, -1, 3)
     around = GlobalIllumination(torch.zeros(1, 5, 7, 3), ALL, harmonics, harmonics, torch.ones(1, 5, 7),
@@ -229,7 +223,7 @@ def solved_room(*shares, given=None):
     light = torch.einsum("jnhwc,jc->nhwc", harmonics, truth[ALL])
     truth *= torch.tensor(shares) / light.mean()
     missing = (light * torch.tensor(shares) / light.mean()).repeat_interleave(2, 1).repeat_interleave(2, 2)
-    room = RoomLight(torch.zeros(BASIS, 3) if given is None else given, 0.3)
+    room = RoomLight(torch.zeros(BASIS, 3), 0.3)
     room.solve(around, torch.ones(1, 10, 14, 3), 1 + missing, torch.ones(1, 10, 14) > 0)
     found, missing = (torch.einsum("jnhwc,jc->nhwc", harmonics, part[ALL]) for part in (room.harmonics, truth))
     return room, found, missing
@@ -239,85 +233,13 @@ def test_a_room_takes_no_light_away():
     """Photographs that are a little too dark in red, too bright in green and blue."""
     room, found, missing = solved_room(-0.02, 0.3, 0.3)
     assert not room.harmonics[:, 0].any()
-    assert 0.5 < float(found[..., 1].mean() / missing[..., 1].mean()) < 0.9
+    assert float(found[..., 1].mean() / missing[..., 1].mean()) == pytest.approx(1, abs=0.05)
     before = {name: value.clone() for name, value in room.state_dict().items()}
     around = GlobalIllumination(torch.zeros(1, 5, 7, 3), ALL, *(torch.ones(len(ALL), 1, 5, 7, 3) for _ in range(2)),
                                  torch.ones(1, 5, 7), torch.ones(1, 10, 14), 2)  # fmt: skip
     broken = torch.full((1, 10, 14, 3), torch.nan)
     room.solve(around, broken, broken + 1, torch.ones(1, 10, 14) > 0)  # a photograph that is no number tells nothing
     assert all(torch.equal(value, before[name]) for name, value in room.state_dict().items())
-
-
-def test_a_room_is_found_that_the_material_has_learnt_to_explain():
-    """The predicted flash is brighter by a third, and more so at rims and to the left; photographs differ in power."""
-    random = torch.Generator().manual_seed(2)
-
-    def drawn(*shape):
-        return torch.rand(*shape, generator=random)
-
-    count = 3
-    harmonics = drawn(len(ALL), count, 5, 7, 1).expand(-1, -1, -1, -1, 3)
-    around = GlobalIllumination(torch.zeros(count, 5, 7, 3), ALL, harmonics, harmonics, torch.ones(count, 5, 7),
-                                 torch.ones(count, 10, 14), 2)  # fmt: skip
-    truth = torch.from_numpy(some_room()).float()
-    truth[PER_FRAME:] = 0
-    facing = 0.2 + 0.8 * drawn(count, 5, 7)
-    flash = facing[..., None] * (0.5 + drawn(count, 1, 1, 3))
-    light = torch.einsum("jnhwc,jc->nhwc", harmonics, truth[ALL])
-    truth *= 0.3 * flash.mean() / light.mean()
-    light *= 0.3 * flash.mean() / light.mean()
-    rims = ((1 - facing**2) / facing)[..., None]
-    left = torch.linspace(-0.3, 0.3, 7)[:, None].expand_as(rims)
-    learnt = flash * (torch.tensor([1.2, 1.4, 1.3])[:, None, None, None] + 0.2 * rims + left)
-
-    def whole(picture):
-        return picture.repeat_interleave(2, 1).repeat_interleave(2, 2)
-
-    found = []
-    for changes in (None, whole(torch.cat([rims, left], -1))):
-        room = RoomLight(torch.zeros(BASIS, 3), 0.3)
-        everywhere = torch.ones(count, 10, 14) > 0
-        room.solve(around, whole(learnt), whole(flash + light), everywhere, changes=changes)
-        found.append(torch.einsum("jnhwc,jc->nhwc", harmonics, room.harmonics[ALL]))
-    assert float((found[0] - light).abs().mean()) > 0.8 * float(light.mean())
-    assert float((found[1] - light).abs().mean()) < 0.2 * float(light.mean())
-
-
-def test_changes_of_a_flash_are_those_of_rims_and_of_its_cone():
-    """As the reflectance and the falloff of the renderer say, for a flash at the lens."""
-    facing, rays = torch.tensor([1.0, 0.6, 0.01]), torch.tensor([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.6, 0.8]])
-    found = flash_changes(facing, rays)
-    expected = [[0, 0, 0, 0], [0.64 / 0.6, np.log(0.96), 0.28, 0], [(1 - 0.15**2) / 0.15, np.log(0.8), 0, -0.6]]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
-def test_normals_for_the_room_face_the_camera(small_capture, monkeypatch):
-    """In the middle of an ellipsoid by about 1, at its outline by 0, nowhere less."""
-    fit, _ = posed(small_capture, refine=("ambient",))
-    seen = []
-    monkeypatch.setattr(optimisation, "flash_changes", lambda *given: seen.append(given) or flash_changes(*given))
-    fit.step()
-    (facing, rays), coverage = seen[0], iteration_of(fit).prediction.coverage
-    inside = coverage > 0.99
-    assert float(facing[inside].min()) > -0.05 and float(facing[inside].amax()) > 0.97
-    near = torch.nn.functional.max_pool2d(1 - coverage[:, None], 3, 1, 1)[:, 0] > 0.5
-    assert float(facing[inside & near].mean()) < float(facing[inside & ~near].mean()) - 0.2
-    assert float(rays[..., 2].min()) > 0.8
-
-
-def test_a_room_is_believed_by_its_share_and_by_its_colours():
-    """A factor of 1 − error² / share²: of a faint room nothing is left, nor of one that colours contradict."""
-    _, found, missing = solved_room(0.3, 0.3, 0.3)
-    assert float((found - missing).abs().mean()) < 0.2 * float(missing.abs().mean())
-    assert found.mean() > 0.95 * missing.mean()
-    _, tinted, missing = solved_room(0.3, 0.25, 0.15)
-    assert tinted.mean() > 0.9 * missing.mean()
-    given = torch.zeros(BASIS, 3)
-    given[0] = 0.5
-    dimmer, *_ = solved_room(-0.1, -0.1, -0.1, given=given)
-    assert (dimmer.harmonics[0] < given[0]).all()  # what a scene file tells may be less
-    for shares in (0.01, 0.015, 0.02), (-0.1, -0.05, 0.15), (-0.1, -0.1, -0.1):
-        assert not solved_room(*shares)[0].harmonics.any()
 
 
 @pytest.mark.parametrize(("field", "value"), [("frame", "lamp"), ("harmonics", "0.1 0.1"), ("harmonics", "a " * 27)])

@@ -37,8 +37,6 @@ from mi_ring.system.machine import device
 #: All options of `--refine` with values in a calibration, in order.
 OPTIONS = [*dict.fromkeys(unknown.option for unknown in UNKNOWNS.values())]
 OPTIONS.insert(OPTIONS.index("lamps"), "ambient")
-ROOM_START = 0.15  #: progress of a fit at which refinement of the room's light begins
-AFTER_CONE = 0.4  #: the same if the cone of the flash is unknown, too: what is dark at its sides looks like a room
 
 
 class Calibration(nn.Module):
@@ -111,14 +109,10 @@ class Calibration(nn.Module):
         now = self.lamps()
         return [now.places.to(device()), now.strengths.to(device())]
 
-    def solves_room(self, progress: float) -> bool:
-        """Test whether the fit estimates the room's light at the current `progress` of the fit, 0 to 1.
-
-        It does so only with `--refine ambient`: from the start if the room's light is the only light of photographs,
-        otherwise from progress 0.15 on, with the cone of a flash from 0.4 on.
-        """
-        start = AFTER_CONE if "falloff" in self.refined else ROOM_START
-        return "ambient" in self.refined and (not self.rig.lit.all() or progress >= start)
+    @property
+    def follows_room(self) -> bool:
+        """Tell whether every iteration estimates the room's light: photographs have no other light, or some of them."""
+        return "ambient" in self.refined and self.room.alone
 
     @torch.no_grad()
     def relight(self, surface: Surface) -> None:

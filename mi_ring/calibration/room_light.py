@@ -18,13 +18,9 @@ DIM = 0.3  #: radiance, in units of the exposure, that is added to the scale of 
 ROBUST = 0.2  #: relative error above which an error counts linearly
 OBJECT = 0.99  #: coverage of pixels that are compared, at least
 COMPARED_WIDTH = 64  #: largest width of the pictures that are compared [px]
-#: A room beside a flash whose light is a smaller share of what photographs show is not believed: another material may
-#: look like it.
-DOUBT = 0.03
 BESIDE_FLASH = 2  #: order of the harmonics of a room beside a flash: photographs tell hardly more
 FINE = 0.3  #: progress from which the only light has its full order
 SHARPNESS = 4.0, 3000.0  #: least and largest sharpness of a lobe: a wider one is for harmonics
-RIDGE_OF_FLASH = 1e-6  #: relative to the trace: a photograph may show too few pixels
 OF_LOBES = "toward", "log_sharpness", "flux", "in_camera", "count"  #: tensors that describe the lobes
 LOBE_RIDGE = 1e-3  #: ridge of a lobe's flux toward 0, relative to its own diagonal of the normal equations
 
@@ -45,7 +41,6 @@ class RoomLight(nn.Module):
     count: Tensor  #: () int, number of lobes; the other rows are unused
     matrix: Tensor  #: (3, rows, rows) of the normal equations, one for each colour
     vector: Tensor  #: (3, rows) right sides of the normal equations
-    shown: Tensor  #: (3, rows + 1) products of the photographs with the harmonics' light, and with themselves
 
     def __init__(
         self, given: Tensor, exposure: float, frames: Iterable[str] = ("world",), alone: bool = False,
@@ -66,7 +61,6 @@ class RoomLight(nn.Module):
         self.register_buffer("harmonics", given.clone())
         self.register_buffer("matrix", torch.zeros(3, rows, rows))
         self.register_buffer("vector", torch.zeros(3, rows))
-        self.register_buffer("shown", torch.zeros(3, rows + 1))
         for name, shape in (("toward", (MOST_LOBES, 3)), ("log_sharpness", (MOST_LOBES,))):
             if alone:
                 self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
@@ -125,12 +119,11 @@ class RoomLight(nn.Module):
         """Set the normal equations to 0, so that earlier photographs no longer count. The light does not change."""
         self.matrix.zero_()
         self.vector.zero_()
-        self.shown.zero_()
 
     @torch.no_grad()
     def solve(
         self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
-        total: Callable[[Tensor], Tensor] = lambda equations: equations, changes: Tensor | None = None,
+        total: Callable[[Tensor], Tensor] = lambda equations: equations,
     ) -> None:  # fmt: skip
         """Add photographs to the normal equations, solve them, and set the harmonics to the solution.
 
@@ -138,30 +131,25 @@ class RoomLight(nn.Module):
         linear radiance. `predicted` must contain the current room light, reflected once; its harmonics without
         occlusion. `counted` (N, H, W) bool: True where a pixel shows only the object. `progress` of the fit, 0 to 1: a
         room without other light has its finest harmonics only later in the fit. `total`: returns the sum of a tensor
-        over all processes; default: one process. `changes` (N, H, W, K): if the only other light is a flash at the
-        lens, how it may differ from the prediction, relative to it; see `without_flash`.
+        over all processes; default: one process.
         """
-        which = [k for k in around.rows if k < len(self.vector[0])]  # without lobes beside a flash
-        sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted, changes), 1))
+        which = around.rows
+        sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted), 1))
         if not bool(sums.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
             return
         self.matrix *= MEMORY
         self.vector *= MEMORY
-        self.shown *= MEMORY
-        matrix, vector, shown = sums.split([len(which) ** 2, len(which), len(which) + 1], 1)
+        matrix, vector = sums.split([len(which) ** 2, len(which)], 1)
         self.matrix[:, torch.tensor(which)[:, None], which] += matrix.unflatten(1, (len(which), -1))
         self.vector[:, which] += vector
-        self.shown[:, [*which, -1]] += shown
         self.update(progress)
 
     def equations(
         self, around: GlobalIllumination, count: int, predicted: Tensor, observed: Tensor, counted: Tensor,
-        changes: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Compute the normal equations of photographs for J = `count` strengths, the first of `around`.
 
-        Returns the matrix (3, J²), the vector (3, J), and products (3, J + 1) like `shown`. The other arguments are
-        those of `solve`.
+        Returns the matrix (3, J²) and the vector (3, J). The other arguments are those of `solve`.
         """
 
         def pooled(pictures: Tensor, factor: int) -> Tensor:
@@ -186,14 +174,9 @@ class RoomLight(nn.Module):
         scale = seen.mean(-1) + DIM * self.exposure
         left = missing - torch.einsum("jnc,jc->nc", basis, now[:count])
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
-        shown = torch.einsum("jnc,nc,n->cj", torch.cat([basis, seen[None]]), seen, weight)
-        if changes is not None:
-            both, photograph = torch.cat([basis, missing[None]]), inside.nonzero()[:, 0]
-            both = without_flash(both, seen - missing, small(changes)[inside], photograph, weight)
-            basis, missing = both[:-1], both[-1]
         matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
-        return matrix.flatten(1), vector, shown
+        return matrix.flatten(1), vector
 
     def update(self, progress: float) -> None:
         """Set the light to the solution of the normal equations. Does nothing while they do not tell each harmonic."""
@@ -212,7 +195,7 @@ class RoomLight(nn.Module):
             given = F.pad(self.given.T, (0, rows - BASIS))
             right = self.vector[..., None] - self.matrix @ given[..., None]
             more = torch.linalg.solve((self.matrix + ridge)[:, free][:, :, free], right[:, free])[..., 0]
-            self.harmonics[free] += self.believed(more, free) * more.T
+            self.harmonics[free] += more.T
         # A room with negative mean radiance is impossible: another part of the model is too bright then.
         self.harmonics[:, self.harmonics[0] < 0] = 0.0
 
@@ -244,49 +227,3 @@ class RoomLight(nn.Module):
             places = [[*free, *lobes].index(k) for k in used]
             result[places, colour] = found.to(result)
         return result[: len(free)], result[len(free) :]
-
-    def believed(self, more: Tensor, free: list[int]) -> float:
-        """Return the factor, 0 to 1, of room light that is believed. `more` (3, J): of the harmonics `free`, as solved.
-
-        It is 1 if some photographs have no flash, and if the capture tells of a room. Otherwise it depends on the mean
-        share of this light in the photographs and on its error: colours that differ tell how large that is, but it is
-        at least `DOUBT`. The form is that of "Estimation with quadratic loss" (James and Stein 1961).
-        """
-        if self.alone or self.given.any():
-            return 1.0
-        shares = (more * self.shown[:, free]).sum(1) / self.shown[:, -1].clamp(min=1e-12)
-        share, error = float(shares.mean()), float(shares.var() / 3) + DOUBT**2
-        return max(0.0, 1 - error / share**2) if share > 0 else 0.0
-
-    def doubted(self) -> Tensor:
-        """Return the first harmonic (3,) [radiance] of a room as faint as one that is not believed.
-
-        It is 0 if every room is believed, and before photographs were seen.
-        """
-        if self.alone or self.given.any():
-            return self.harmonics.new_zeros(3)
-        return torch.where(self.shown[:, 0] > 0, DOUBT * self.shown[:, -1] / self.shown[:, 0], 0.0)
-
-
-def without_flash(pictures: Tensor, lit: Tensor, changes: Tensor, photograph: Tensor, weight: Tensor) -> Tensor:
-    """Remove from pictures (J, n, 3) what another material or another flash could explain.
-
-    These take a room's light for their own before the room is solved for: at first, nothing else explains it.
-
-    For each photograph and colour, least squares remove the multiples of `lit` (n, 3), the object without room, and of
-    its products with `changes` (n, K) and with its own logarithm, as for another curve of the camera. `photograph`
-    (n,): number of the photograph of each pixel. `weight` (n,) of the pixels.
-    """
-    bright = lit.clamp(min=1e-6 * float(lit.abs().mean()) + 1e-12)
-    columns = torch.stack([lit, lit * bright.log(), *(lit * change[:, None] for change in changes.T)], -1)
-    result = pictures.clone()
-    for number in photograph.unique():
-        own = photograph == number
-        used, weights = columns[own], weight[own]
-        used = used / used.square().mean(0).sqrt().clamp(min=1e-12)
-        matrix = torch.einsum("nca,ncb,n->cab", used, used, weights)
-        ridge = RIDGE_OF_FLASH * matrix.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] + 1e-12
-        right = torch.einsum("nca,jnc,n->caj", used, pictures[:, own], weights)
-        factors = torch.linalg.solve(matrix + ridge * torch.eye(used.shape[-1]).to(matrix), right)
-        result[:, own] -= torch.einsum("nca,caj->jnc", used, factors)
-    return result

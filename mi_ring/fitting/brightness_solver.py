@@ -150,18 +150,6 @@ def flash_slope(calibration: Calibration, index: np.ndarray, directions: Tensor,
     return (facing / along - 3 * v / v.square().sum(-1, keepdim=True))[..., :2]
 
 
-def flash_changes(facing: Tensor, rays: Tensor) -> Tensor:
-    """Compute how the light of a flash at the lens may differ from the prediction, relative to it: (N, H, W, 4).
-
-    The rims of a rough matte surface ("Generalization of Lambert's reflectance model", Oren and Nayar 1994), and the
-    flash's cone: its exponent and tilts. `facing` (N, H, W): cosines between normals and directions to the camera.
-    `rays` (N, H, W, 3): unit directions of the pixels in the camera's axes.
-    """
-    facing = facing.clamp(LEAST_FACING, 1)
-    left, up, forward = rays.unbind(-1)
-    return torch.stack([(1 - facing**2) / facing, forward.log(), left, up], -1)
-
-
 def columns(directions: Tensor, sideways: Tensor, held: Tensor, slopes: Tensor, shown: Tensor) -> Tensor:
     """Make the columns (n, 8) that explain the errors of n pixels of a photograph, each with mean 0.
 

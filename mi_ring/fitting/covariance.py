@@ -1,8 +1,9 @@
-"""Computes the standard deviations of the unknowns of calibration. Surface and material are unknown, too.
+"""Joint least squares of all unknowns of calibration. Surface and material are unknown, too.
 
-The covariance follows from least squares at the solution: from the derivatives of the photographs with respect to each
-unknown, and from the errors of the predictions ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section
-8.1). Each patch of the surface has unknowns of its own, which are eliminated (the same, section 6.1).
+All photographs are compared with their predictions from the current model. The normal equations follow from these
+errors, and from the derivatives with respect to each unknown. Each patch of the surface has unknowns of its own, which
+are eliminated ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section 6.1). The covariance is the inverse
+of the matrix (the same, section 8.1).
 """
 
 from collections.abc import Callable
@@ -48,6 +49,13 @@ class Layout:
         self.first["ambient"] = self.count
         self.count += 3 * len(self.room)
 
+    def values(self) -> np.ndarray:
+        """Return the current parameters (N,). The room's light counts as 0."""
+        unknowns = [
+            getattr(self.calibration, name).double().numpy(force=True).ravel() for name in self.calibration.widths
+        ]
+        return np.concatenate([*unknowns, np.zeros(3 * len(self.room))])
+
     def centring(self) -> np.ndarray:
         """Return the matrix (N, N) that subtracts from powers and gains their means, as `Calibration` does."""
         result = np.eye(self.count)
@@ -74,31 +82,53 @@ class Layout:
         return result
 
 
-@torch.no_grad()
+@dataclass(frozen=True)
+class JointEquations:
+    """Normal equations `matrix` x = `vector` of all parameters of a calibration, in the units of their priors.
+
+    Their solution is the change from the current parameters that explains the photographs best, whatever the surface
+    and the material are. The priors of the parameters are not part of them.
+    """
+
+    layout: Layout
+    matrix: np.ndarray  #: (N, N), the Fisher information
+    vector: np.ndarray  #: (N,)
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, problem: Problem, model: Model, renderer: Renderer, level: int) -> "JointEquations":
+        """Render all fitted photographs from the current model, and compare them with the photographs.
+
+        `level` of the mesh: at most `LEVEL` is rendered. Colours and silhouettes eliminate the surface separately, so
+        its prior counts twice.
+        """
+        calibration, ring = model.calibration, model.ring
+        assert calibration is not None
+        layout = Layout(calibration)
+        surface = renderer.show(model, min(level, LEVEL))
+        s = ring.domain.sample(min(level, LEVEL))[0]
+        patches = Patches(surface, s, float(ring.radius), ring.brdf_net.bsdf_parameters)
+        colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))
+        lit = problem.capture.photographs.lit[problem.fitted]
+        kinds = [problem.fitted[lit == kind] for kind in (True, False)]
+        for index in (some for kind in kinds for some in problem.capture.together(kind)):
+            scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
+            group = CovarianceGroup(problem, calibration, surface, patches, ring.indirect, index, scale)
+            compare(group, layout, colours, silhouettes)
+        calibration.relight(surface)  # as it was
+        (matrix, vector), (more, shift) = (part.without_patches() for part in (colours, silhouettes))
+        return cls(layout, matrix + more, vector + shift)
+
+
 def covariance(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, np.ndarray]:
     """Compute the standard deviation of each refined unknown of calibration.
 
     Returns a dict from names of unknowns to arrays in the shape and the unit of the unknown. The room's light is
-    "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. All fitted photographs are rendered.
-    `level`: level of the mesh of the results; at most `LEVEL` is rendered. Colours and silhouettes eliminate the
-    surface separately, so its prior counts twice.
+    "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. `level` of the mesh of the results.
     """
-    calibration, ring = model.calibration, model.ring
-    assert calibration is not None
-    layout = Layout(calibration)
-    level = min(level, LEVEL)
-    surface = renderer.show(model, level)
-    patches = Patches(surface, ring.domain.sample(level)[0], float(ring.radius), ring.brdf_net.bsdf_parameters)
-    colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))
-    lit = problem.capture.photographs.lit[problem.fitted]
-    kinds = [problem.fitted[lit == kind] for kind in (True, False)]
-    for index in (some for kind in kinds for some in problem.capture.together(kind)):
-        scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
-        group = CovarianceGroup(problem, calibration, surface, patches, ring.indirect, index, scale)
-        compare(group, layout, colours, silhouettes)
-    calibration.relight(surface)  # as it was
-    precision = np.eye(layout.count) + colours.information() + silhouettes.information()
-    centring = layout.centring()
+    joint = JointEquations.of(problem, model, renderer, level)
+    layout, calibration, centring = joint.layout, joint.layout.calibration, joint.layout.centring()
+    precision = np.eye(layout.count) + joint.matrix
     spread = np.sqrt(np.diag(centring @ np.linalg.inv(precision) @ centring.T))
     result = {
         name: width * spread[layout.first[name] :][: getattr(calibration, name).numel()]
@@ -118,8 +148,10 @@ class Equations:
 
     def __init__(self, count: int, patches: int, of_each: int) -> None:
         self.matrix, self.squares, self.pixels = np.zeros((count, count)), 0.0, 0
+        self.vector = np.zeros(count)  #: products of the parameters with the errors
         self.own = np.zeros((patches, of_each, of_each))  #: products of a patch's unknowns
-        self.cross = np.zeros((patches, of_each, count))  #: and of these with the parameters
+        self.cross = np.zeros((patches, of_each, count))  #: of these with the parameters
+        self.own_vector = np.zeros((patches, of_each))  #: and of these with the errors
 
     def add(
         self, slopes: Tensor, error: Tensor, counted: Tensor, places: np.ndarray, local: Tensor, patch: np.ndarray
@@ -134,12 +166,14 @@ class Equations:
         if not counted.any():
             return
         slopes, own, at = slopes[:, counted].double(), local[:, counted].double(), patch[counted.numpy()]
-        flat = slopes.flatten(1)
+        flat, off = slopes.flatten(1), error[counted].double()
         np.add.at(self.matrix, np.ix_(places, places), (flat @ flat.T).numpy())
+        np.add.at(self.vector, places, (flat @ off.flatten()).numpy())
         summed = csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), (len(self.own), len(at)))
-        products = [torch.einsum("apc,bpc->pab", own, other).flatten(1).numpy() for other in (own, slopes)]
+        products = [torch.einsum("apc,bpc->pab", own, other).flatten(1).numpy() for other in (own, slopes, off[None])]
         self.own += (summed @ products[0]).reshape(self.own.shape)
         self.cross[:, :, places] += (summed @ products[1]).reshape(*self.own.shape[:2], len(places))
+        self.own_vector += summed @ products[2]
         height, width, channels = error.shape
         error = torch.where(counted[..., None], error, 0.0).double()
         error = F.pad(error, (0, 0, 0, -width % BLOCK, 0, -height % BLOCK))
@@ -147,19 +181,19 @@ class Equations:
         self.squares += float(blocks.square().sum())
         self.pixels += channels * int(counted.sum())
 
-    def information(self) -> np.ndarray:
-        """Compute the Fisher information matrix (N, N) of all added photographs.
+    def without_patches(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normal equations of the N parameters alone, for all added photographs: (N, N) and (N,).
 
-        It is the inverse of the covariance of the N parameters, whatever the unknowns of the patches are. These have
-        priors of standard deviation 1.
+        The matrix is the Fisher information, the inverse of the covariance whatever the unknowns of the patches are.
+        These have priors of standard deviation 1.
         """
         if not self.squares:
-            return 0 * self.matrix
+            return 0 * self.matrix, 0 * self.vector
         weight = self.pixels / self.squares
         own = np.eye(self.own.shape[1]) + weight * self.own
-        solved = np.linalg.solve(own, weight * self.cross)
-        count = len(self.matrix)
-        return weight * (self.matrix - self.cross.reshape(-1, count).T @ solved.reshape(-1, count))
+        solved = np.linalg.solve(own, weight * np.dstack([self.cross, self.own_vector]))
+        explained = weight * np.tensordot(self.cross, solved, ((0, 1), (0, 1)))  # by the patches
+        return weight * self.matrix - explained[:, :-1], explained[:, -1] - weight * self.vector
 
 
 @dataclass(frozen=True)

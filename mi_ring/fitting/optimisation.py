@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.errors import InputError
 from mi_ring.fitting.agreeing_adam import AgreeingAdam
-from mi_ring.fitting.brightness_solver import BrightnessSolver, flash_changes
+from mi_ring.fitting.brightness_solver import BrightnessSolver
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import unfold
 from mi_ring.fitting.exposure_solver import ExposureSolver
@@ -22,10 +22,10 @@ from mi_ring.fitting.pose_solver import PoseSolver
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import START, finds_small_lights
 from mi_ring.fitting.renderer import Renderer
+from mi_ring.fitting.room_solver import solve_room
 from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
 from mi_ring.fitting.small_lights import find_lobes
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.scene.lights import shared_emitters
 from mi_ring.system.machine import has_fast_bfloat16
 
 CALIBRATION_RATE = 0.1  #: Adam's learning rate for unknowns of calibration [standard deviations]
@@ -80,27 +80,21 @@ def detail_steppers(ring: FittedObject, config: Config) -> list[Stepper]:
 
 
 @torch.no_grad()
-def solve_room(calibration: Calibration, it: Iteration) -> None:
+def follow_room(calibration: Calibration, it: Iteration) -> None:
     """Estimate the room's light, in place: add an iteration's photographs to the normal equations and solve them.
 
-    Does nothing if the room's light is not refined, or not yet. If some photographs have no other light, these alone
-    count: with a flash, its error may be larger than all light of the room.
+    Does nothing if the room's light is not refined, or if all photographs have other light. If some have, the others
+    alone count: with a flash, its error may be larger than all light of the room.
     """
     other, seen, batch = it.prediction.other_light, it.observation, it.batch
-    if other is None or not calibration.solves_room(it.progress):
+    if other is None or not calibration.follows_room:
         return
     photographs = it.prediction.photographs
     telling = ~photographs.lit if photographs.mixed else photographs.in_room
     pixels = it.object_pixels() & ~seen.clipped.any(-1)
     pixels &= torch.from_numpy(telling[batch.photographs]).to(pixels.device)[:, None, None]
     observed = calibration.linear(seen.rgb, batch.photographs, batch.scale)
-    changes, rig = None, calibration.rig
-    if rig.beside_lens and rig.lit.all() and not shared_emitters(it.context.capture.scene):
-        rays = calibration.directions(batch.photographs, batch.scale)
-        in_world = torch.einsum("nij,nhwj->nhwi", calibration().cameras[batch.photographs, :, :3], rays)
-        changes = flash_changes(-(it.prediction.normals * in_world).sum(-1), rays).to(pixels.device)
-        pixels &= changes.isfinite().all(-1)
-    calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum, changes)
+    calibration.room.solve(other, it.prediction.without_room, observed, pixels, it.progress, batch.share.sum)
 
 
 class Optimisation:
@@ -140,7 +134,7 @@ class Optimisation:
         """
         loss, it = evaluate()
         if self.model.calibration and not it.stage.detail:
-            solve_room(self.model.calibration, it)
+            follow_room(self.model.calibration, it)
         for solver in self.solvers:
             solver.look(it)
         if not it.terms:
@@ -209,6 +203,17 @@ class Optimisation:
                 for parameter in (calibration.room.toward, calibration.room.log_sharpness):
                     optimizer.state.pop(parameter, None)  # it is of another lobe
             self.guard.keep()  # so that a retreat does not restore the old lobes
+
+    def find_room(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
+        """Find the light of a room beside other light, if it is time. `iteration`: the next one, from 0."""
+        calibration, problem = self.model.calibration, self.problem
+        if calibration is None or "ambient" not in calibration.refined or calibration.follows_room:
+            return
+        if schedule.room_due(iteration):
+            level = schedule.stage(iteration).level
+            found = problem.processes.on_first(lambda: solve_room(problem, self.model, renderer, level))
+            calibration.room.harmonics.copy_(torch.from_numpy(found))
+            self.guard.keep()  # so that a retreat does not restore the old room
 
     def follow(self, pairs: Iterable[tuple[nn.Parameter, nn.Parameter]]) -> None:
         """Continue with larger parameters: pairs (old, new with further rows). Adam knows no gradients of these yet."""

@@ -135,7 +135,7 @@ class Renderer:
         scene has a table, interreflection is averaged over iterations. Otherwise the averages are {}.
         """
         calibration, indirect, rows = model.calibration, model.ring.indirect, photographs.room_rows
-        if calibration and calibration.solves_room(batch.progress):
+        if calibration and calibration.follows_room:
             rows = calibration.room.which
         if not (indirect or rows):
             return None, {}

@@ -1,5 +1,6 @@
 """Collects the content of `calibration.json`: the calibration that a fit has found, as plain numbers."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from mi_ring.calibration.unknowns import Exposure
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.room_solver import doubt
 
 
 @torch.no_grad()
@@ -41,10 +43,11 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
         if capture.photographs.dark:
             what = "mean radiance of the environment: red, green, blue"
         mean = torch.zeros_like(room.harmonics)
-        mean[0] = torch.hypot(torch.from_numpy(deviations["ambient"]).to(mean), room.doubted())
+        mean[0] = torch.from_numpy(deviations["ambient"])
         given = None if capture.lobes is None else capture.lobes.scaled(rig.power)
         lights = (room.given, given), (room.harmonics, room.lobes()), (mean, None)
         before, after, spread = (calibration.room_share(*light).tolist() for light in lights)
+        spread = [math.hypot(part, doubt(room)) for part in spread]
         unknowns["ambient"] = {"what": what, "before": before, "after": after, "std": spread,
                                "harmonics": room.harmonics.tolist(),
                                "lobes": [] if refined.lobes is None else refined.lobes.values().tolist()}  # fmt: skip

@@ -1,0 +1,68 @@
+"""Finds the light of a room beside a flash, by least squares in which surface, material and flash are unknown, too.
+
+While a fit does not know of the room, surface, material and powers explain its light. So the errors of a prediction
+show hardly anything of it. The joint equations tell what all of them together explain better with a room.
+"""
+
+import numpy as np
+import torch
+
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.calibration.room_light import RoomLight
+from mi_ring.fitting.covariance import ROOM, JointEquations
+from mi_ring.fitting.model import Model
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.renderer import Renderer
+
+#: Another reflectance than that of the model may look like a room that is this share of the flash on the object.
+DOUBT = 0.03
+FAINT = 0.01  #: least brightness of a room for the next number [exposure]
+SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share of the first
+
+
+@torch.no_grad()
+def solve_room(problem: Problem, model: Model, renderer: Renderer, level: int) -> np.ndarray:
+    """Find the harmonics (BASIS, 3) of a room beside a flash, from all fitted photographs. Changes nothing.
+
+    `level` of the mesh. The room is shrunk toward that of the capture, the less it is told: by the form of "Estimation
+    with quadratic loss" (James and Stein 1961).
+    """
+    calibration = model.calibration
+    assert calibration is not None
+    room, joint = calibration.room, JointEquations.of(problem, model, renderer, level)
+    layout, unit = joint.layout, ROOM * problem.exposure
+    here = layout.first["ambient"] + np.arange(3 * len(layout.room))
+    given, now = (part.double().numpy(force=True) for part in (room.given, room.harmonics))
+    current = layout.values()
+    current[here] = (now - given)[layout.room].ravel() / unit
+    right, precision = joint.vector + joint.matrix @ current, np.ones(layout.count)
+    first = np.linalg.solve(joint.matrix + np.diag(precision), right)[here[:3]]
+    bright = max(float((given[0] + unit * first).mean()), FAINT * problem.exposure)
+    precision[here[3:]] = (unit / (SIDES * bright)) ** 2
+    covariance = np.linalg.inv(joint.matrix + np.diag(precision))
+    more, deviation = np.zeros_like(given), np.zeros_like(given)
+    more[layout.room] = unit * (covariance @ right)[here].reshape(-1, 3)
+    deviation[0] = unit * np.sqrt(np.diag(covariance)[here[:3]])
+    found = given + believed(calibration, more, deviation) * more
+    found[:, found[0] < 0] = 0  # a room with negative mean radiance is impossible
+    return found
+
+
+def believed(calibration: Calibration, more: np.ndarray, deviation: np.ndarray) -> float:
+    """Return the factor, 0 to 1, of room light that is believed.
+
+    `more` (BASIS, 3): the light that the capture does not tell of. `deviation`: the standard deviation of the first
+    harmonic. It is 1 if the capture tells of a room. Otherwise the shares of the light count: their mean, their
+    deviation, how much colours differ, and `doubt`.
+    """
+    if (least := doubt(calibration.room)) == 0:
+        return 1.0
+    share, error = (calibration.room_share(torch.from_numpy(part)).double() for part in (more, deviation))
+    mean = float(share.mean())
+    variance = float(error.mean()) ** 2 + float(share.var()) / 3 + least**2
+    return max(0.0, 1 - variance / mean**2) if mean > 0 else 0.0
+
+
+def doubt(room: RoomLight) -> float:
+    """Return the share of the flash that light may have that is wrongly taken for a room's: 0 if there is no flash."""
+    return 0.0 if room.alone or room.given.any() else DOUBT

@@ -1,0 +1,122 @@
+"""The light of a room beside a flash, from the joint equations of all unknowns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import mi_ring
+from mi_ring.fitting import covariance, optimisation, room_solver
+from mi_ring.fitting.covariance import ROOM, JointEquations, Layout
+from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.room_solver import DOUBT, solve_room
+from mi_ring.rendering.spherical_harmonics import BASIS, PER_FRAME
+
+
+def fit_of(small_capture, given=None, **settings):
+    """A fit of a flash and of a room's light; `given` (BASIS, 3): the room that the scene file tells of."""
+    capture = mi_ring.load_capture(small_capture)
+    capture = capture if given is None else replace(capture, room=given)
+    settings = {"refine": ("power", "ambient"), "domain": "sphere", "indirect": False} | settings
+    return Fit(capture, mi_ring.Config(**settings))
+
+
+def room_like(fit, *shares):
+    """Harmonics (BASIS, 3) of a room whose colours are these shares of the flash, brighter from one side."""
+    room = np.zeros((BASIS, 3))
+    room[0] = 1.0
+    room[1:4, :] = [[0.3], [-0.2], [0.1]]
+    return room * shares / fit.model.calibration.room_share(torch.from_numpy(room)).numpy()
+
+
+def told(fit, room, monkeypatch, information=1e6):
+    """What is found of a `room` if the equations are those of a linear problem that tells this much of each unknown."""
+    layout = Layout(fit.model.calibration)
+    random = np.random.default_rng(3)
+    slopes = random.normal(size=(4 * layout.count, layout.count))
+    matrix = information * slopes.T @ slopes / len(slopes)
+    given = fit.model.calibration.room.given.numpy()
+    truth = layout.values()
+    truth[layout.first["ambient"] :] = ((room - given)[layout.room] / (ROOM * fit.problem.exposure)).ravel()
+    equations = JointEquations(layout, matrix, matrix @ (truth - layout.values()))
+    monkeypatch.setattr(JointEquations, "of", lambda *_: equations)
+    return solve_room(fit.problem, fit.model, fit.renderer, 2)
+
+
+def test_a_room_is_believed_by_its_share_and_by_its_colours(small_capture, monkeypatch):
+    """A factor of 1 − error² / share²: of a faint room nothing is left, nor of one that colours contradict."""
+    fit = fit_of(small_capture)
+    for shares in ([0.3] * 3, [0.3, 0.25, 0.2]):
+        room = room_like(fit, *shares)
+        variance = DOUBT**2 + np.var(shares, ddof=1) / 3
+        found = told(fit, room, monkeypatch)
+        np.testing.assert_allclose(found, (1 - variance / np.mean(shares) ** 2) * room, rtol=2e-3, atol=1e-5)
+    assert np.abs(told(fit, room, monkeypatch, 1.0)).max() < 0.8 * room.max()  # hardly told
+    for shares in (0.01, 0.015, 0.02), (-0.1, -0.05, 0.15), (-0.1, -0.1, -0.1):
+        assert not told(fit, room_like(fit, *shares), monkeypatch).any()
+    found = told(fit, room_like(fit, 0.5, 0.4, -0.02), monkeypatch)
+    assert found[0, :2].all() and not found[:, 2].any()  # no colour of a room is darker than black
+
+
+def test_what_the_scene_file_tells_of_a_room_may_be_more_or_less(small_capture, monkeypatch):
+    given = np.zeros((BASIS, 3))
+    given[0] = 1.0
+    fit = fit_of(small_capture, given)
+    for factor in 0.97, 1.02:
+        found = told(fit, factor * given, monkeypatch)
+        np.testing.assert_allclose(found[0], factor * given[0], atol=2e-3)
+
+
+def test_a_room_is_found_that_material_and_powers_explain(small_capture, monkeypatch):
+    """Photographs show less flash than is predicted, by a factor that differs; a room makes up for it."""
+    fit = fit_of(small_capture, levels=(3,), widths=(56,), shares=(1.0,))
+    truth = room_like(fit, 0.2, 0.25, 0.3)
+    compare = covariance.compare
+
+    def with_room(group, *others):
+        lit, coverage = group.direct()
+        transfer = group.other(lit, coverage)[2]
+        flash = torch.linspace(0.75, 0.9, len(lit))[:, None, None, None] * lit
+        layout = others[0]
+        shown = flash + torch.einsum("jnhwc,jc->nhwc", transfer, torch.from_numpy(truth[layout.room]).to(lit))
+        seen = group.problem.capture.observe(group.index, group.scale)
+        seen = seen._replace(rgb=group.calibration.recorded(shown, group.index, group.scale), mask=coverage)
+        with monkeypatch.context() as patch:
+            patch.setattr(type(group.problem.capture), "observe", lambda *_: seen)
+            compare(group, *others)
+
+    monkeypatch.setattr(covariance, "compare", with_room)
+    for _ in range(3):  # brightness is compared by its logarithm: one solution is not exact
+        found = solve_room(fit.problem, fit.model, fit.renderer, 3)
+        fit.model.calibration.room.harmonics.copy_(torch.from_numpy(found))
+    share, true = (fit.model.calibration.room_share(torch.from_numpy(part)) for part in (found, truth))
+    np.testing.assert_allclose(share, true, rtol=0.3)  # priors and belief take some of it
+    assert np.corrcoef(found[1:4].ravel(), truth[1:4].ravel())[0, 1] > 0.9
+    assert not found[PER_FRAME:].any()
+
+
+def test_a_fit_solves_for_it_three_times(small_capture, monkeypatch):
+    """At 0.4, 0.6 and 0.8 of the iterations that shape the surface. Not at all if they are too few."""
+    fit = fit_of(small_capture, iterations=100, detail="none")
+    asked = []
+    monkeypatch.setattr(optimisation, "solve_room", lambda *_: asked.append(True) or np.full((BASIS, 3), 0.25))
+    due = [k for k in range(fit.iterations) if fit.schedule.room_due(k)]
+    assert due == [40, 60, 80]
+    for k in range(38, 42):
+        fit.optimisation.find_room(fit.renderer, fit.schedule, k)
+    assert len(asked) == 1 and (fit.model.calibration.room.harmonics == 0.25).all()
+    short = fit_of(small_capture, iterations=30)
+    assert [k for k in range(30) if short.schedule.room_due(k)] == [24]
+    known = fit_of(small_capture, refine=("power",))
+    known.optimisation.find_room(known.renderer, known.schedule, 40)
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_what_cannot_be_told_widens_the_deviation(small_capture, given):
+    """By `DOUBT`, unless the scene file tells of a room."""
+    room = np.zeros((BASIS, 3))
+    room[0] = given
+    fit = fit_of(small_capture, room)
+    assert room_solver.doubt(fit.model.calibration.room) == (0 if given else DOUBT)
