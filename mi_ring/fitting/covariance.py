@@ -96,11 +96,13 @@ class JointEquations:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, problem: Problem, model: Model, renderer: Renderer, level: int) -> "JointEquations":
-        """Render all fitted photographs from the current model, and compare them with the photographs.
+    def of(
+        cls, problem: Problem, model: Model, renderer: Renderer, level: int, most: int | None = None
+    ) -> "JointEquations":
+        """Render fitted photographs from the current model, and compare them with the photographs.
 
-        `level` of the mesh: at most `LEVEL` is rendered. Colours and silhouettes eliminate the surface separately, so
-        its prior counts twice.
+        `most`: how many at most, evenly chosen; None: all of them. `level` of the mesh: at most `LEVEL` is rendered.
+        Colours and silhouettes eliminate the surface separately, so its prior counts twice.
         """
         calibration, ring = model.calibration, model.ring
         assert calibration is not None
@@ -109,8 +111,9 @@ class JointEquations:
         s = ring.domain.sample(min(level, LEVEL))[0]
         patches = Patches(surface, s, float(ring.radius), ring.brdf_net.bsdf_parameters)
         colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))
-        lit = problem.capture.photographs.lit[problem.fitted]
-        kinds = [problem.fitted[lit == kind] for kind in (True, False)]
+        chosen = problem.fitted[:: -(-len(problem.fitted) // most) if most else 1]
+        lit = problem.capture.photographs.lit[chosen]
+        kinds = [chosen[lit == kind] for kind in (True, False)]
         for index in (some for kind in kinds for some in problem.capture.together(kind)):
             scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
             group = CovarianceGroup(problem, calibration, surface, patches, ring.indirect, index, scale)

@@ -16,20 +16,21 @@ from mi_ring.fitting.renderer import Renderer
 
 #: Another reflectance than that of the model may look like a room that is this share of the flash on the object.
 DOUBT = 0.03
+MOST = 40  #: photographs that are compared: more hardly tell more, and take longer
 FAINT = 0.01  #: least brightness of a room for the next number [exposure]
 SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share of the first
 
 
 @torch.no_grad()
 def solve_room(problem: Problem, model: Model, renderer: Renderer, level: int) -> np.ndarray:
-    """Find the harmonics (BASIS, 3) of a room beside a flash, from all fitted photographs. Changes nothing.
+    """Find the harmonics (BASIS, 3) of a room beside a flash, from fitted photographs. Changes nothing.
 
     `level` of the mesh. The room is shrunk toward that of the capture, the less it is told: by the form of "Estimation
     with quadratic loss" (James and Stein 1961).
     """
     calibration = model.calibration
     assert calibration is not None
-    room, joint = calibration.room, JointEquations.of(problem, model, renderer, level)
+    room, joint = calibration.room, JointEquations.of(problem, model, renderer, level, MOST)
     layout, unit = joint.layout, ROOM * problem.exposure
     here = layout.first["ambient"] + np.arange(3 * len(layout.room))
     given, now = (part.double().numpy(force=True) for part in (room.given, room.harmonics))

@@ -16,7 +16,7 @@ RAMP = 0.05  #: progress in which a learning rate rises from 0 to full, after it
 MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
 #: Progress at which small lights of an unknown room are sought: when harmonics have their full order, and later.
 LIGHTS_SOUGHT = 0.36, 0.5, 0.65, 0.8
-ROOM_SOLVED = 0.4, 0.6, 0.8  #: progress at which a fit estimates the light of a room beside a flash
+ROOM_SOLVED = 0.4, 0.6  #: progress at which a fit estimates the light of a room beside a flash
 COAT_DECIDED = 0.5  #: progress at which a fit decides about a second lobe of highlights
 EARLIEST = 20  #: iterations before any of these: shorter fits know too little of surface and material
 INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
