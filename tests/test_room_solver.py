@@ -104,12 +104,12 @@ def test_a_fit_solves_for_it_twice(small_capture, monkeypatch):
     due = [k for k in range(fit.iterations) if fit.schedule.room_due(k)]
     assert due == [40, 60]
     for k in range(38, 42):
-        fit.optimisation.find_room(fit.renderer, fit.schedule, k)
+        fit.optimisation.find_light(fit.renderer, fit.schedule, k)
     assert len(asked) == 1 and (fit.model.calibration.room.harmonics == 0.25).all()
     short = fit_of(small_capture, iterations=33)
     assert [k for k in range(30) if short.schedule.room_due(k)] == []
     known = fit_of(small_capture, refine=("power",))
-    known.optimisation.find_room(known.renderer, known.schedule, 40)
+    known.optimisation.find_light(known.renderer, known.schedule, 40)
     assert len(asked) == 1
 
 

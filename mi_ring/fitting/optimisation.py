@@ -188,13 +188,16 @@ class Optimisation:
             self.model.calibration.room.forget()
             self.guard.keep()  # so that a retreat does not restore the old equations
 
-    def find_small_lights(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
-        """Find the lobes of the room's light anew, if it is time. `iteration`: the next one, from 0."""
+    def find_light(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
+        """Find the room beside other light, or the lobes of a room alone, if it is time. `iteration`: next, from 0."""
         calibration, problem = self.model.calibration, self.problem
-        if calibration is None or not finds_small_lights(calibration, problem.config):
+        if calibration is None or "ambient" not in calibration.refined:
             return
-        if schedule.lights_due(iteration):
-            level = schedule.stage(iteration).level
+        level = schedule.stage(iteration).level
+        if schedule.room_due(iteration) and not calibration.follows_room:
+            room = problem.processes.on_first(lambda: solve_room(problem, self.model, renderer, level))
+            calibration.room.harmonics.copy_(torch.from_numpy(room))
+        elif schedule.lights_due(iteration) and finds_small_lights(calibration, problem.config):
             found = problem.processes.on_first(lambda: find_lobes(problem, self.model, renderer, level, iteration))
             if found is None:
                 return
@@ -202,18 +205,9 @@ class Optimisation:
             for optimizer in self.optimizers:
                 for parameter in (calibration.room.toward, calibration.room.log_sharpness):
                     optimizer.state.pop(parameter, None)  # it is of another lobe
-            self.guard.keep()  # so that a retreat does not restore the old lobes
-
-    def find_room(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
-        """Find the light of a room beside other light, if it is time. `iteration`: the next one, from 0."""
-        calibration, problem = self.model.calibration, self.problem
-        if calibration is None or "ambient" not in calibration.refined or calibration.follows_room:
+        else:
             return
-        if schedule.room_due(iteration):
-            level = schedule.stage(iteration).level
-            found = problem.processes.on_first(lambda: solve_room(problem, self.model, renderer, level))
-            calibration.room.harmonics.copy_(torch.from_numpy(found))
-            self.guard.keep()  # so that a retreat does not restore the old room
+        self.guard.keep()  # so that a retreat does not restore the old light
 
     def follow(self, pairs: Iterable[tuple[nn.Parameter, nn.Parameter]]) -> None:
         """Continue with larger parameters: pairs (old, new with further rows). Adam knows no gradients of these yet."""
