@@ -15,7 +15,7 @@ from helpers.bumpy_ball import OFF_CAMERA, Setting, tensor
 import mi_ring
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
-from mi_ring.fitting.covariance import covariance
+from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.lighting import Lighting, with_found_lamps, with_lighting
 from mi_ring.fitting.refinement import refined_of
 from mi_ring.rendering import prediction
@@ -188,7 +188,7 @@ def test_a_fit_under_two_unknown_lamps(under_two_lamps, tmp_path):
     validation = fit.course.validation
     assert validation["unexplained"] > 0 and validation["before"] > 0  # of those that are kept out
     (before,) = lamp_lights(fit.calibrated().scene)
-    covariance(fit.problem, fit.model, fit.renderer, 3)
+    JointEquations.of(fit.problem, fit.model, fit.renderer, 3)
     after = light_of(lamps_of(fit.renderer.surface.scene)[0])
     np.testing.assert_allclose(after.rgb, before.rgb, rtol=1e-6)
     np.testing.assert_allclose(after.vector, before.vector, rtol=1e-6)

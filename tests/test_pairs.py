@@ -20,8 +20,8 @@ from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.pairs import camera_numbers, varies_in_exposure, with_room_photographs
 from mi_ring.errors import InputError
-from mi_ring.fitting.covariance import covariance
 from mi_ring.fitting.exposure_solver import ExposureSolver
+from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.pose_solver import summed
 from mi_ring.fitting.problem import held_out_photographs
 from mi_ring.fitting.refinement import refined_of
@@ -253,7 +253,8 @@ def test_deviations_of_both_kinds(fitted):
     with threads_of(1):
         running = mi_ring.Fit(problem.given, config)
         running.model.calibration.room.harmonics.copy_(fit.model.calibration.room.harmonics)
-        found = covariance(running.problem, running.model, running.renderer, 3)
+        joint = JointEquations.of(running.problem, running.model, running.renderer, 3)
+        found = joint.deviations(running.problem.exposure)
     widths = running.model.calibration.widths
     assert found["turn"].shape == (VIEWS, 3) and found["power"].shape == (2 * VIEWS, 3)
     assert all(np.isfinite(value).all() and (value > 0).all() for value in found.values())

@@ -234,7 +234,8 @@ def roughened(scene, folder, sigma):
 @pytest.mark.parametrize(("sigma", "low", "high"), [(0.0, 0.0, 0.05), (0.4, 0.3, 0.5)], ids=["lambert", "rough"])
 def test_a_fit_finds_how_rough_a_matte_surface_is(small_capture, tmp_path, sigma, low, high):
     capture = load_capture(roughened(small_capture, tmp_path / "rough", sigma))
-    settings = Config(iterations=60, levels=(3,), widths=(56,), shares=(1,), batch=4, detail="none", refine=("none",))
+    settings = Config(iterations=60, levels=(3,), widths=(56,), shares=(1,), batch=4, detail="none", refine=("none",),
+                      indirect=False, lobes="1")  # fmt: skip
     ring = Fit(capture, settings).run()
     with torch.no_grad():
         found = ring.brdf_net(ring.domain.sample(3)[0])["diffuse_roughness"]

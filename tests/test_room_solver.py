@@ -7,9 +7,11 @@ import pytest
 import torch
 
 import mi_ring
-from mi_ring.fitting import covariance, optimisation, room_solver
-from mi_ring.fitting.covariance import ROOM, JointEquations, Layout
+from mi_ring.fitting import joint_equations, optimisation, room_solver
+from mi_ring.fitting.comparison import ROOM
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.joint_equations import JointEquations
+from mi_ring.fitting.normal_equations import Layout
 from mi_ring.fitting.room_solver import DOUBT, solve_room
 from mi_ring.rendering.spherical_harmonics import BASIS, PER_FRAME
 
@@ -72,7 +74,7 @@ def test_a_room_is_found_that_material_and_powers_explain(small_capture, monkeyp
     """Photographs show less flash than is predicted, by a factor that differs; a room makes up for it."""
     fit = fit_of(small_capture, levels=(3,), widths=(56,), shares=(1.0,))
     truth = room_like(fit, 0.2, 0.25, 0.3)
-    compare = covariance.compare
+    compare = joint_equations.compare
 
     def with_room(group, *others):
         lit, coverage = group.direct()
@@ -86,7 +88,7 @@ def test_a_room_is_found_that_material_and_powers_explain(small_capture, monkeyp
             patch.setattr(type(group.problem.capture), "observe", lambda *_: seen)
             compare(group, *others)
 
-    monkeypatch.setattr(covariance, "compare", with_room)
+    monkeypatch.setattr(joint_equations, "compare", with_room)
     for _ in range(3):  # brightness is compared by its logarithm: one solution is not exact
         found = solve_room(fit.problem, fit.model, fit.renderer, 3)
         fit.model.calibration.room.harmonics.copy_(torch.from_numpy(found))

@@ -9,8 +9,8 @@ import numpy as np
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.course import Course
-from mi_ring.fitting.covariance import covariance
 from mi_ring.fitting.fine_texture import sharpened
+from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
@@ -40,7 +40,7 @@ def result_of(
 
     def summarised() -> dict[str, Any]:
         masked = replace(problem, capture=capture)
-        return summary(problem, model, refined, covariance(masked, model, renderer, ring.subdivisions))
+        return summary(problem, model, refined, JointEquations.of(masked, model, renderer, ring.subdivisions))
 
     # Otherwise the room's axes are those of the scene file.
     found_alone = problem.lighting.kind != "capture" or problem.capture.photographs.mixed

@@ -9,7 +9,8 @@ import torch
 
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.room_light import RoomLight
-from mi_ring.fitting.covariance import ROOM, JointEquations
+from mi_ring.fitting.comparison import ROOM
+from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
@@ -32,7 +33,7 @@ def solve_room(problem: Problem, model: Model, renderer: Renderer, level: int) -
     assert calibration is not None
     room, joint = calibration.room, JointEquations.of(problem, model, renderer, level, MOST)
     layout, unit = joint.layout, ROOM * problem.exposure
-    here = layout.first["ambient"] + np.arange(3 * len(layout.room))
+    here = layout.places("ambient")
     given, now = (part.double().numpy(force=True) for part in (room.given, room.harmonics))
     current = layout.values()
     current[here] = (now - given)[layout.room].ravel() / unit

@@ -9,24 +9,26 @@ import torch
 from mi_ring.calibration.unknown import Found
 from mi_ring.calibration.unknowns import Exposure
 from mi_ring.capture.capture import Capture
+from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.room_solver import doubt
 
 
 @torch.no_grad()
-def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[str, np.ndarray]) -> dict[str, Any]:
+def summary(problem: Problem, model: Model, refined: Capture, joint: JointEquations) -> dict[str, Any]:
     """Collect the content of calibration.json. Writes no file.
 
-    `refined`: the calibrated capture. `deviations`: a dict from names of unknowns to their standard deviations. Returns
-    a dict with these keys. `refined`: list of the refined options. `light`: kind of the light. `unknowns`: a dict with,
-    for each unknown that photographs share, its meaning (`what`), its value `before` and `after` the fit, and its
-    standard deviation `std`. `photographs`: a dict with, for each fitted
-    photograph, how far the object has moved in it (`moved_px`) and the values of its own unknowns.
+    `refined`: the calibrated capture. `joint`: the equations of its unknowns. Returns a dict with these keys.
+    `refined`: list of the refined options. `light`: kind of the light. `unknowns`: a dict with, for each unknown that
+    photographs share, its meaning (`what`), its value `before` and `after` the fit, and its standard deviation `std`.
+    `alike`: a list of pairs of options whose unknowns photographs hardly tell apart, with their correlation.
+    `photographs`: a dict with, for each fitted photograph, how far the object has moved in it (`moved_px`) and the
+    values of its own unknowns.
     """
     calibration, ring = model.calibration, model.ring
     assert calibration is not None
-    rig, capture = calibration.rig, problem.capture
+    rig, capture, deviations = calibration.rig, problem.capture, joint.deviations(problem.exposure)
     several = bool(problem.lighting.lamps)
     found = Found(rig, capture, refined, calibration.power_factor, calibration.lamps(), several)
     values = {name: calibration.value(name).double().numpy(force=True) for name in calibration.widths}
@@ -70,4 +72,5 @@ def summary(problem: Problem, model: Model, refined: Capture, deviations: dict[s
                 key, own[key], std[key] = entry
         photographs[capture.names[k]] = own | {"std": std}
     return {"refined": list(calibration.refined), "light": str(problem.lighting), "unknowns": unknowns,
+            "alike": [{"options": [one, other], "correlation": value} for one, other, value in joint.alike()],
             "photographs": photographs}  # fmt: skip

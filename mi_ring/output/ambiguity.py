@@ -1,6 +1,7 @@
-"""The warning that a fit under unknown light cannot determine everything."""
+"""Warnings about what photographs cannot tell."""
 
 from pathlib import Path
+from typing import Any
 
 from mi_ring.system.files import read_json
 
@@ -18,6 +19,12 @@ def ambiguity(light: str) -> str:
     if "lamp" not in light:
         text += "; smooth variations of light and reflectance can hardly be separated either"
     return text + "."
+
+
+def hardly_told_apart(alike: list[dict[str, Any]]) -> str:
+    """Return a warning about unknowns that photographs hardly tell apart. `alike`: that of calibration.json."""
+    pairs = [f"{' and '.join(pair['options'])} (correlation {pair['correlation']:.2f})" for pair in alike]
+    return f"The photographs hardly tell apart {', '.join(pairs)}." if pairs else ""
 
 
 def ambiguity_of(run: Path) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
-from mi_ring.output.ambiguity import ambiguity
+from mi_ring.output.ambiguity import ambiguity, hardly_told_apart
 from mi_ring.output.svg import new_figure, svg_uri
 from mi_ring.rendering.spherical_harmonics import PER_FRAME, room_envmap
 from mi_ring.scene.assembly import lamp_lights
@@ -25,7 +25,7 @@ class Panel(NamedTuple):
 
     rows: list[tuple[str, str, str, str]]  #: quantity, before, after, standard deviation
     chart: str  #: a data URI
-    untold: str  #: the warning of `ambiguity`
+    untold: str  #: warnings of `mi_ring.output.ambiguity`
 
 
 def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
@@ -39,7 +39,8 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
     if light != "capture":
         rows.insert(0, ("kind of light, by coarse fits", "", light, ""))
     rows += small_lights(after) + [row(entry) for entry in of_photographs(refined["photographs"])]
-    return Panel(rows, chart(before, after, refined["photographs"]), ambiguity(light))
+    untold = f"{ambiguity(light)} {hardly_told_apart(refined.get('alike', []))}".strip()
+    return Panel(rows, chart(before, after, refined["photographs"]), untold)
 
 
 def small_lights(capture: Capture) -> list[tuple[str, str, str, str]]:

@@ -7,10 +7,13 @@ import pytest
 import torch
 
 import mi_ring
+from mi_ring.fitting.comparison import ROOM
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.covariance import BLOCK, ROOM, Equations, Layout, covariance
 from mi_ring.fitting.fit import Fit
+from mi_ring.fitting.joint_equations import ALIKE, JointEquations
+from mi_ring.fitting.normal_equations import BLOCK, Equations, Layout
 from mi_ring.metrics.capture_findings import moved_far
+from mi_ring.output.ambiguity import hardly_told_apart
 from mi_ring.output.calibration_panel import panel
 
 
@@ -60,7 +63,8 @@ def test_photographs_tell_unknowns_and_keep_them_as_they_are(small_capture):
     surface = running.renderer.show(running.model, 3)
     mesh = {name: np.array(surface.params[surface.prefix + name]) for name in ("vertex_positions", "vertex_normals",
                                                                               "vertex_roughness")}  # fmt: skip
-    found = covariance(running.problem, running.model, running.renderer, 3)
+    joint = JointEquations.of(running.problem, running.model, running.renderer, 3)
+    found = joint.deviations(running.problem.exposure)
     for name, value in mesh.items():
         np.testing.assert_allclose(np.array(surface.params[surface.prefix + name]), value, atol=1e-6)
     for name, value in calibration.state_dict().items():
@@ -100,7 +104,8 @@ def test_pixels_beside_the_blocks_count_as_well():
 def test_photographs_tell_of_the_room(small_capture):
     """Much more than its prior does."""
     running = Fit(mi_ring.load_capture(small_capture), Config(refine=("ambient",), domain="sphere"))
-    found = covariance(running.problem, running.model, running.renderer, 3)
+    joint = JointEquations.of(running.problem, running.model, running.renderer, 3)
+    found = joint.deviations(running.problem.exposure)
     assert list(found) == ["ambient"] and found["ambient"].shape == (3,) and (found["ambient"] > 0).all()
     assert (found["ambient"] < 0.3 * ROOM * running.problem.exposure).all()
 
@@ -126,6 +131,28 @@ def test_unknowns_of_patches_are_eliminated():
     whole_vector = -weight * np.array(columns) @ noise[counted.numpy()].ravel()
     np.testing.assert_allclose(np.linalg.solve(matrix, vector), np.linalg.solve(whole, whole_vector)[:2], rtol=1e-3)
     assert matrix[0, 0] < 0.7 * weight * (columns[0] @ columns[0])
+
+
+def test_what_photographs_hardly_tell_apart_is_said(small_capture):
+    """Of three unknowns two, whose correlation is given; of several components the best combination counts."""
+    config = Config(refine=("light", "curve", "ambient"), domain="sphere")
+    layout = Layout(Fit(mi_ring.load_capture(small_capture), config).model.calibration)
+    light, curve, room = layout.places("light"), layout.places("curve")[0], layout.places("ambient")
+    for correlation in (0.97, 0.8):
+        covariance = np.eye(layout.count)
+        across = np.array([0.6, 0.0, 0.8])  # with a combination of the flash's axes, with none of them so much
+        covariance[curve, light] = covariance[light, curve] = correlation * across
+        covariance[curve, room[5]] = covariance[room[5], curve] = 0.2  # not of the first harmonic
+        width = np.array([1.0, 0.1, 3.0, *[0.5] * (layout.count - 3)])[: layout.count] / 4
+        matrix = np.linalg.inv(covariance * np.outer(width, width)) - np.eye(layout.count)
+        found = JointEquations(layout, matrix, np.zeros(layout.count)).alike()
+        if correlation > ALIKE:
+            ((one, other, value),) = found
+            assert {one, other} == {"light", "curve"} and value == pytest.approx(correlation, rel=1e-6)
+            told = [{"options": [one, other], "correlation": value}]
+            assert hardly_told_apart(told) == f"The photographs hardly tell apart {one} and {other} (correlation 0.97)."
+        else:
+            assert not found and hardly_told_apart([]) == ""
 
 
 def test_photographs_that_moved_far_are_told_from_those_that_all_moved():
