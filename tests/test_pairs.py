@@ -219,7 +219,7 @@ def test_the_room_is_found_and_written(fitted, pairs):
         assert toward @ true > np.cos(np.radians(15)) * np.linalg.norm(toward) * np.linalg.norm(true)
         pair = np.stack([found[1:9].ravel(), truth[1:9].ravel()])
         assert np.corrcoef(pair)[0, 1] > 0.9
-    assert doubt(fit.model.calibration.room) == 0
+    assert doubt(fit.model.calibration) == 0
     assert again.names == fit.capture.names and (folder / "environment.exr").is_file()
     assert again.photographs.lit.tolist() == [True] * VIEWS + [False] * VIEWS
     assert len(ElementTree.parse(folder / "scene.xml").findall("sensor")) == 2 * VIEWS

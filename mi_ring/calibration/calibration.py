@@ -111,7 +111,7 @@ class Calibration(nn.Module):
 
     @property
     def follows_room(self) -> bool:
-        """Tell whether every iteration estimates the room's light: photographs have no other light, or some of them."""
+        """Tell whether each iteration estimates the room's light: if some or all photographs have no other light."""
         return "ambient" in self.refined and self.room.alone
 
     @torch.no_grad()

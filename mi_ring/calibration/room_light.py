@@ -134,7 +134,7 @@ class RoomLight(nn.Module):
         over all processes; default: one process.
         """
         which = around.rows
-        sums = total(torch.cat(self.equations(around, len(which), predicted, observed, counted), 1))
+        sums = total(torch.cat(self.equations(around, predicted, observed, counted), 1))
         if not bool(sums.isfinite().all()):  # a single pixel of the renderer may be NaN, and equations are kept
             return
         self.matrix *= MEMORY
@@ -145,9 +145,9 @@ class RoomLight(nn.Module):
         self.update(progress)
 
     def equations(
-        self, around: GlobalIllumination, count: int, predicted: Tensor, observed: Tensor, counted: Tensor,
+        self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Compute the normal equations of photographs for J = `count` strengths, the first of `around`.
+        """Compute the normal equations of photographs for the J strengths of `around`.
 
         Returns the matrix (3, J²) and the vector (3, J). The other arguments are those of `solve`.
         """
@@ -168,11 +168,10 @@ class RoomLight(nn.Module):
         missing, seen = small(observed - predicted)[inside], small(observed)[inside]
         now = self.strengths[around.rows]
         lit = torch.einsum("jnhwc,jc->nhwc", around.unoccluded, now)
-        lit = lit - torch.einsum("jnhwc,jc->nhwc", around.transfer[count:], now[count:])
-        basis = torch.stack([pooled(picture, coarser)[inside] for picture in around.transfer[:count]])  # (J, n, 3)
+        basis = torch.stack([pooled(picture, coarser)[inside] for picture in around.transfer])  # (J, n, 3)
         missing = missing + pooled(lit, coarser)[inside]
         scale = seen.mean(-1) + DIM * self.exposure
-        left = missing - torch.einsum("jnc,jc->nc", basis, now[:count])
+        left = missing - torch.einsum("jnc,jc->nc", basis, now)
         weight = (ROBUST / (left.abs().mean(-1) / scale).clamp(min=ROBUST)) / scale**2
         matrix = torch.einsum("jnc,knc,n->cjk", basis, basis, weight)
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)

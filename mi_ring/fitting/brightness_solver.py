@@ -27,7 +27,6 @@ LEAST_TILT = 0.1  #: and at least this
 DOUBT_OF_CONE, DOUBT_OF_CONTRAST = 0.05, 0.01
 RIDGE, FLOOR = 1e-6, 1e-12  #: what is added to the diagonal of the normal equations: relative to it, and besides
 LOOKS = 80  #: number of iterations in which the contrast is solved for: later the material would take it bit by bit
-LEAST_FACING = 0.15  #: cosine between normal and direction to the camera below which rims no longer become brighter
 GRAZING = 0.2  #: cosine between normal and light below which the change of brightness no longer grows
 COLUMNS = 8  #: of `columns`
 CONE, CONTRAST, SHOWN, AWAY, PLACE = [0, 1, 2], [3], [4], [5], [6, 7]  #: numbers of them

@@ -17,10 +17,11 @@ from mi_ring.rendering.global_illumination import GlobalIllumination
 from mi_ring.rendering.lobe_light import LobeLight
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
-from mi_ring.scene.plain_mesh import POSITIONS
+from mi_ring.scene.plain_mesh import NORMALS, POSITIONS
 
 SPP = 4  #: samples per pixel
 ROOM, DIM = 10.0, 0.01  #: prior and step of the room's light [exposure]
+CHANGED = 0.5, 2.0  #: least and greatest factor of other light: at grazing angles the quotient is noisy
 STEP = 0.2  #: of the unknowns to either side [standard deviations of their priors]
 
 
@@ -88,10 +89,11 @@ class Group:
                 transfer = torch.stack([around.upsampled(around.transfer[k]).cpu() for k in chosen])
         return bounced, room_light, transfer
 
-    def local_slopes(self, picture: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    def local_slopes(self, lit: Tensor, picture: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
         """Return derivatives with respect to the unknowns of each pixel's patch: (L, n, H, W, 3), and (1, n, H, W).
 
-        The first are of `picture`, a function of direct light. The second are of the coverage, with respect to the
+        The first are of `picture`, a function of direct light and of a factor of all other light, which an unknown of
+        the material changes as it changes direct light `lit`. The second are of the coverage, with respect to the
         displacement.
         """
         moving = torch.zeros(0)
@@ -100,8 +102,11 @@ class Group:
             sides: list[tuple[Tensor, Tensor]] = []
             for step in (STEP, -STEP):
                 with self.patches.changed(unknown, step):
-                    lit, coverage = self.direct()
-                sides.append((picture(lit), coverage))
+                    changed, coverage = self.direct()
+                factor = torch.ones_like(lit)
+                if unknown.name not in (NORMALS, POSITIONS):
+                    factor = torch.where(lit > 0, changed / lit, 1.0).clamp(*CHANGED)
+                sides.append((picture(changed, factor), coverage))
             slope, covering = ((plus - minus) / (2 * STEP) for plus, minus in zip(*sides))
             moving = covering if unknown.name == POSITIONS else moving
             slopes += [slope * channel for channel in torch.eye(3)] if unknown.channels == 3 else [slope]
@@ -124,8 +129,10 @@ def compare(at: Group, layout: Layout, colours: Equations, silhouettes: Equation
     lit, coverage = at.direct()
     bounced, room_light, transfer = at.other(lit, coverage)
 
-    def picture(lit: Tensor, bounced: Tensor = bounced, gain: Tensor | float = 1.0) -> Tensor:
-        light = gain * (lit + bounced + room_light)
+    def picture(
+        lit: Tensor, bounced: Tensor = bounced, gain: Tensor | float = 1.0, reflected: Tensor | float = 1.0
+    ) -> Tensor:
+        light = gain * (lit + reflected * (bounced + room_light))
         return perceived(calibration.recorded(light, index, at.scale), problem.exposure, "log")
 
     def beside(name: str, k: int, places: np.ndarray, step: float) -> tuple[Tensor, Tensor]:
@@ -158,7 +165,7 @@ def compare(at: Group, layout: Layout, colours: Equations, silhouettes: Equation
     changing, covering = (torch.stack(part) for part in zip(*slopes))
     room = layout.first["ambient"] + np.arange(3 * len(transfer))
     own = np.column_stack([*(places for *_, places in unknowns), np.tile(room, (len(index), 1))])
-    local, moving = at.local_slopes(picture)
+    local, moving = at.local_slopes(lit, lambda changed, factor: picture(changed, reflected=factor))
     patch = at.patches.seen(at.photographs())
     error, off = picture(lit) - perceived(seen.rgb, problem.exposure, "log"), coverage - seen.mask
     surely = seen.surely(coverage) & ~seen.clipped.any(-1)

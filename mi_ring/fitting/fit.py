@@ -103,7 +103,7 @@ class Fit(Renamed):
         started = time.perf_counter()
         if "masks" in self.problem.config.refine and self.schedule.masks_due(self.iteration):
             self.refine_masks()
-        self.optimisation.find_light(self.renderer, self.schedule, self.iteration)
+        self.optimisation.find_light(self.renderer, self.schedule, self.iteration, self.capture)
         if self.problem.config.lobes == "auto" and self.schedule.coat_due(self.iteration):
             self.course.coat |= select_coat(self.problem, self.model, self.renderer, self.optimisation, self.capture)
         batch = self.sampler.draw(self.problem, self.schedule, self.ring.domain, self.iteration)

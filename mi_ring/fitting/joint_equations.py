@@ -1,6 +1,6 @@
 """Joint least squares of all unknowns of calibration. Surface and material are unknown, too.
 
-All photographs are compared with their predictions from the current model. The normal equations follow from these
+Photographs are compared with their predictions from the current model. The normal equations follow from these
 errors, and from the derivatives with respect to each unknown. Each patch of the surface has unknowns of its own, which
 are eliminated ("Bundle Adjustment: A Modern Synthesis", Triggs et al. 2000, section 6.1). The covariance is the inverse
 of the matrix (the same, section 8.1).
@@ -18,6 +18,7 @@ from mi_ring.fitting.model import Model
 from mi_ring.fitting.normal_equations import Equations, Layout
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
+from mi_ring.geometry.hull import evenly_spaced
 
 COMPARED_WIDTH = 96  #: largest width of the compared pictures [px]
 LEVEL = 5  #: of the mesh in them, at most
@@ -43,8 +44,9 @@ class JointEquations:
     ) -> "JointEquations":
         """Render fitted photographs from the current model, and compare them with the photographs.
 
-        `most`: how many at most, evenly chosen; None: all of them. `level` of the mesh: at most `LEVEL` is rendered.
-        Colours and silhouettes eliminate the surface separately, so its prior counts twice.
+        `most`: how many with a light of their own, and how many without, at most, evenly spaced; None: all. `level` of
+        the mesh: at most `LEVEL` is rendered. Colours and silhouettes eliminate the surface separately, so its prior
+        counts twice.
         """
         calibration, ring = model.calibration, model.ring
         assert calibration is not None
@@ -53,9 +55,9 @@ class JointEquations:
         s = ring.domain.sample(min(level, LEVEL))[0]
         patches = Patches(surface, s, float(ring.radius), ring.brdf_net.bsdf_parameters)
         colours, silhouettes = (Equations(layout.count, patches.count, n) for n in (patches.components, 1))
-        chosen = problem.fitted[:: -(-len(problem.fitted) // most) if most else 1]
-        lit = problem.capture.photographs.lit[chosen]
-        kinds = [chosen[lit == kind] for kind in (True, False)]
+        lit = problem.capture.photographs.lit[problem.fitted]
+        kinds = [problem.fitted[lit == kind] for kind in (True, False)]
+        kinds = [kind[evenly_spaced(len(kind), most or len(kind))] for kind in kinds if len(kind)]
         for index in (some for kind in kinds for some in problem.capture.together(kind)):
             scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
             group = Group(problem, calibration, surface, patches, ring.indirect, index, scale)

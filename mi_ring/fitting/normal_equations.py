@@ -32,11 +32,10 @@ class Layout:
         return self.first[name] + np.arange(count)
 
     def values(self) -> np.ndarray:
-        """Return the current parameters (N,). The room's light counts as 0."""
-        unknowns = [
-            getattr(self.calibration, name).double().numpy(force=True).ravel() for name in self.calibration.widths
-        ]
-        return np.concatenate([*unknowns, np.zeros(3 * len(self.room))])
+        """Return the current parameters (N,). Powers and gains have mean 1. The room's light counts as 0."""
+        unknowns = [getattr(self.calibration, name) for name in self.calibration.widths]
+        values = [unknown.double().numpy(force=True).ravel() for unknown in unknowns]
+        return self.centring() @ np.concatenate([*values, np.zeros(3 * len(self.room))])
 
     def centring(self) -> np.ndarray:
         """Return the matrix (N, N) that subtracts from powers and gains their means, as `Calibration` does."""

@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from mi_ring.calibration.calibration import Calibration
+from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.fitting.agreeing_adam import AgreeingAdam
 from mi_ring.fitting.brightness_solver import BrightnessSolver
@@ -188,14 +190,20 @@ class Optimisation:
             self.model.calibration.room.forget()
             self.guard.keep()  # so that a retreat does not restore the old equations
 
-    def find_light(self, renderer: Renderer, schedule: Schedule, iteration: int) -> None:
-        """Find the room beside other light, or the lobes of a room alone, if it is time. `iteration`: next, from 0."""
-        calibration, problem = self.model.calibration, self.problem
+    def find_light(self, renderer: Renderer, schedule: Schedule, iteration: int, capture: Capture) -> None:
+        """Find the room beside other light, or the lobes of a room alone, if it is time.
+
+        `iteration`: the next one, from 0. `capture`: that of the problem, with the masks that are used now.
+        """
+        calibration, problem = self.model.calibration, replace(self.problem, capture=capture)
         if calibration is None or "ambient" not in calibration.refined:
             return
-        level = schedule.stage(iteration).level
-        if schedule.room_due(iteration) and not calibration.follows_room:
+        level, progress = schedule.stage(iteration).level, schedule.progress(iteration)
+        one_material = progress < problem.lighting.one_material_until  # the joint equations have many
+        if schedule.room_due(iteration) and not (calibration.follows_room or one_material):
             room = problem.processes.on_first(lambda: solve_room(problem, self.model, renderer, level))
+            if room is None:
+                return
             calibration.room.harmonics.copy_(torch.from_numpy(room))
         elif schedule.lights_due(iteration) and finds_small_lights(calibration, problem.config):
             found = problem.processes.on_first(lambda: find_lobes(problem, self.model, renderer, level, iteration))

@@ -8,26 +8,23 @@ import numpy as np
 import torch
 
 from mi_ring.calibration.calibration import Calibration
-from mi_ring.calibration.room_light import RoomLight
 from mi_ring.fitting.comparison import ROOM
 from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
 
-#: Another reflectance than that of the model may look like a room that is this share of the flash on the object.
-DOUBT = 0.03
+DOUBT = 0.03  #: share of the flash that a room seems to have where the true reflectance is not one of the model's
 MOST = 40  #: photographs that are compared: more hardly tell more, and take longer
 FAINT = 0.01  #: least brightness of a room for the next number [exposure]
 SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share of the first
 
 
 @torch.no_grad()
-def solve_room(problem: Problem, model: Model, renderer: Renderer, level: int) -> np.ndarray:
-    """Find the harmonics (BASIS, 3) of a room beside a flash, from fitted photographs. Changes nothing.
+def solve_room(problem: Problem, model: Model, renderer: Renderer, level: int) -> np.ndarray | None:
+    """Find the harmonics (BASIS, 3) of a room beside other light. None: the photographs do not tell.
 
-    `level` of the mesh. The room is shrunk toward that of the capture, the less it is told: by the form of "Estimation
-    with quadratic loss" (James and Stein 1961).
+    Renders the surface at a `level` of the mesh. The calibration does not change. What is found is `believed` in part.
     """
     calibration = model.calibration
     assert calibration is not None
@@ -38,6 +35,8 @@ def solve_room(problem: Problem, model: Model, renderer: Renderer, level: int) -
     current = layout.values()
     current[here] = (now - given)[layout.room].ravel() / unit
     right, precision = joint.vector + joint.matrix @ current, np.ones(layout.count)
+    if not np.isfinite(right).all():
+        return None
     first = np.linalg.solve(joint.matrix + np.diag(precision), right)[here[:3]]
     bright = max(float((given[0] + unit * first).mean()), FAINT * problem.exposure)
     precision[here[3:]] = (unit / (SIDES * bright)) ** 2
@@ -51,20 +50,24 @@ def solve_room(problem: Problem, model: Model, renderer: Renderer, level: int) -
 
 
 def believed(calibration: Calibration, more: np.ndarray, deviation: np.ndarray) -> float:
-    """Return the factor, 0 to 1, of room light that is believed.
+    """Return the share, 0 to 1, of found room light that a fit uses.
 
-    `more` (BASIS, 3): the light that the capture does not tell of. `deviation`: the standard deviation of the first
-    harmonic. It is 1 if the capture tells of a room. Otherwise the shares of the light count: their mean, their
-    deviation, how much colours differ, and `doubt`.
+    `more` (BASIS, 3): the light that was found beyond that of the capture. `deviation` (BASIS, 3): standard deviation
+    of its first harmonic. The share is 1 − error² / light², as in "Estimation with quadratic loss" (James and Stein
+    1961). The error has three parts: the deviation, the difference of the colours, and `doubt`.
     """
-    if (least := doubt(calibration.room)) == 0:
+    if (least := doubt(calibration)) == 0:
         return 1.0
-    share, error = (calibration.room_share(torch.from_numpy(part)).double() for part in (more, deviation))
-    mean = float(share.mean())
-    variance = float(error.mean()) ** 2 + float(share.var()) / 3 + least**2
+    light, error = (calibration.room_share(torch.from_numpy(part)).double() for part in (more, deviation))
+    mean = float(light.mean())
+    variance = float(error.mean()) ** 2 + float(light.var()) / 3 + least**2
     return max(0.0, 1 - variance / mean**2) if mean > 0 else 0.0
 
 
-def doubt(room: RoomLight) -> float:
-    """Return the share of the flash that light may have that is wrongly taken for a room's: 0 if there is no flash."""
-    return 0.0 if room.alone or room.given.any() else DOUBT
+def doubt(calibration: Calibration) -> float:
+    """Return the share of the flash below which a room is not believed.
+
+    It is 0 if the scene tells of harmonics of a room, and if some or all photographs have no light of their own.
+    """
+    certain = calibration.room.given.any() or not calibration.rig.lit.all()
+    return 0.0 if certain else DOUBT

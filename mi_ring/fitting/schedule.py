@@ -18,7 +18,9 @@ MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they ar
 LIGHTS_SOUGHT = 0.36, 0.5, 0.65, 0.8
 ROOM_SOLVED = 0.4, 0.6  #: progress at which a fit estimates the light of a room beside a flash
 COAT_DECIDED = 0.5  #: progress at which a fit decides about a second lobe of highlights
-EARLIEST = 20  #: iterations before any of these: shorter fits know too little of surface and material
+EARLIEST = (
+    20  #: iterations before light is sought or a coat decided: shorter fits know too little of surface and material
+)
 INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
 

@@ -49,7 +49,7 @@ def summary(problem: Problem, model: Model, refined: Capture, joint: JointEquati
         given = None if capture.lobes is None else capture.lobes.scaled(rig.power)
         lights = (room.given, given), (room.harmonics, room.lobes()), (mean, None)
         before, after, spread = (calibration.room_share(*light).tolist() for light in lights)
-        spread = [math.hypot(part, doubt(room)) for part in spread]
+        spread = [math.hypot(part, doubt(calibration)) for part in spread]
         unknowns["ambient"] = {"what": what, "before": before, "after": after, "std": spread,
                                "harmonics": room.harmonics.tolist(),
                                "lobes": [] if refined.lobes is None else refined.lobes.values().tolist()}  # fmt: skip
