@@ -1,15 +1,14 @@
 """Do the standard deviations of calibration cover the truth? Small captures with known truth are made and fitted.
 
     python benchmarks/coverage.py MESH … [--out out/coverage] [--count 20] [--materials MATERIAL …]
+                                  [OPTIONS OF mi-ring fit]
 
 Capture number k shows MESH and MATERIAL number k, in turn. The flash is beside the place that the scene file says, and
 its power varies. About every other capture has a room, brighter from some sides, of which the scene file knows nothing.
-Each is fitted by `fast` with `--refine auto`.
+Each is fitted by `fast`.
 
 Prints a Markdown table with machine and date: of each unknown the largest error, the median of the stated standard
-deviations, and how often the truth is within 1.645 of them, which is nine times of ten if they are right. The same
-command continues after an interruption.
-"""
+deviations, and how often the truth is within 1.645 XX"""
 
 import argparse
 import datetime
@@ -29,6 +28,7 @@ from mi_ring.calibration.rig import Rig
 
 MATERIALS = ["principled base_color=0.6,0.3,0.1 roughness=0.4", "principled base_color=0.2,0.4,0.5 roughness=0.7"]
 ROOM, LIGHT, POWER = 0.1, 3.0, 10.0  #: options of mi-ring synthesize
+SHOWN = 0.3  #: least correlation that is printed
 WITHIN = 1.645  #: standard deviations that hold nine of ten normally distributed errors
 
 
@@ -78,13 +78,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/coverage"))
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--materials", nargs="+", default=MATERIALS)
-    options = parser.parse_args()
+    options, of_fit = parser.parse_known_args()
+    correlations: dict[str, list[float]] = {}
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for k in range(options.count):
         mesh, material = (names[k % len(names)] for names in (options.meshes, options.materials))
         folder = synthesized(mesh, material, k, options.out / str(k))
-        fitted(folder / "scene.xml", folder / "fit", ["--preset", "fast"])
-        for name, both in errors(folder, folder / "fit").items():
+        out = folder / "-".join(["fit", *of_fit])
+        for pair in fitted(folder / "scene.xml", out, ["--preset", "fast", *of_fit])["correlations"]:
+            correlations.setdefault(" and ".join(sorted(pair["options"])), []).append(pair["value"])
+        for name, both in errors(folder, out).items():
             found.setdefault(name, []).append(both)
             print(k, name, *both, file=sys.stderr, flush=True)
     rows = []
@@ -93,8 +96,12 @@ def main() -> None:
         rows.append([name, f"{np.abs(error).max():.2g}", f"{np.median(std):.2g}",
                      f"{np.mean(np.abs(error) <= WITHIN * std):.0%} of {len(error)}"])  # fmt: skip
     speed = product_speed(4096, 4096, torch.float32) / 1e9
-    print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; {options.count} captures\n")
-    print(table(["unknown", "largest error", "stated deviation", "truth within 1.645"], rows))
+    print(
+        f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; {options.count} captures; {' '.join(of_fit)}\n"
+    )
+    print(table(["unknown", "largest error", "stated deviation", "truth within 1.645"], rows), "\n")
+    medians = sorted(((float(np.median(values)), pair) for pair, values in correlations.items()), reverse=True)
+    print(table(["pair", "correlation"], [[pair, f"{value:.2f}"] for value, pair in medians if value > SHOWN]))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from mi_ring.geometry.hull import evenly_spaced
 
 COMPARED_WIDTH = 96  #: largest width of the compared pictures [px]
 LEVEL = 5  #: of the mesh in them, at most
-ALIKE = 0.9  #: correlation of unknowns above which they are hardly told apart
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,8 @@ class JointEquations:
             result["ambient"] = ROOM * exposure * spread[layout.places("ambient")][:3]
         return result
 
-    def alike(self) -> list[tuple[str, str, float]]:
-        """List pairs of options of `--refine` whose unknowns photographs hardly tell apart, and their correlation.
+    def correlations(self) -> list[tuple[str, str, float]]:
+        """List all pairs of options of `--refine`, and how much their unknowns look alike in the photographs, 0 to 1.
 
         It is the largest canonical correlation ("Relations between two sets of variates", Hotelling 1936). Of the room
         the first harmonic counts. Poses are left out: they always look like another surface.
@@ -103,6 +102,5 @@ class JointEquations:
                                  ((one, one), (other, other), (one, other)))  # fmt: skip
             explained = np.linalg.pinv(own, hermitian=True) @ both @ np.linalg.pinv(others, hermitian=True) @ both.T
             correlation = float(np.linalg.eigvals(explained).real.max().clip(0, 1)) ** 0.5
-            if correlation > ALIKE:
-                result.append((one, other, correlation))
+            result.append((one, other, correlation))
         return result

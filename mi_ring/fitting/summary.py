@@ -22,7 +22,7 @@ def summary(problem: Problem, model: Model, refined: Capture, joint: JointEquati
     `refined`: the calibrated capture. `joint`: the equations of its unknowns. Returns a dict with these keys.
     `refined`: list of the refined options. `light`: kind of the light. `unknowns`: a dict with, for each unknown that
     photographs share, its meaning (`what`), its value `before` and `after` the fit, and its standard deviation `std`.
-    `alike`: a list of pairs of options whose unknowns photographs hardly tell apart, with their correlation.
+    `correlations`: a list of pairs of options, with how much their unknowns look alike in the photographs, 0 to 1.
     `photographs`: a dict with, for each fitted photograph, how far the object has moved in it (`moved_px`) and the
     values of its own unknowns.
     """
@@ -72,5 +72,5 @@ def summary(problem: Problem, model: Model, refined: Capture, joint: JointEquati
                 key, own[key], std[key] = entry
         photographs[capture.names[k]] = own | {"std": std}
     return {"refined": list(calibration.refined), "light": str(problem.lighting), "unknowns": unknowns,
-            "alike": [{"options": [one, other], "correlation": value} for one, other, value in joint.alike()],
+            "correlations": [{"options": [one, other], "value": value} for one, other, value in joint.correlations()],
             "photographs": photographs}  # fmt: skip

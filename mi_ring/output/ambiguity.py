@@ -5,6 +5,8 @@ from typing import Any
 
 from mi_ring.system.files import read_json
 
+ALIKE = 0.9  #: correlation of unknowns above which photographs hardly tell them apart
+
 
 def ambiguity(light: str) -> str:
     """Return a warning for the user about what the fit could not determine; empty if the capture gave the light.
@@ -21,9 +23,10 @@ def ambiguity(light: str) -> str:
     return text + "."
 
 
-def hardly_told_apart(alike: list[dict[str, Any]]) -> str:
-    """Return a warning about unknowns that photographs hardly tell apart. `alike`: that of calibration.json."""
-    pairs = [f"{' and '.join(pair['options'])} (correlation {pair['correlation']:.2f})" for pair in alike]
+def hardly_told_apart(correlations: list[dict[str, Any]]) -> str:
+    """Return a warning about unknowns that photographs hardly tell apart. `correlations`: those of calibration.json."""
+    alike = [pair for pair in correlations if pair["value"] > ALIKE]
+    pairs = [f"{' and '.join(pair['options'])} (correlation {pair['value']:.2f})" for pair in alike]
     return f"The photographs hardly tell apart {', '.join(pairs)}." if pairs else ""
 
 

@@ -39,7 +39,7 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
     if light != "capture":
         rows.insert(0, ("kind of light, by coarse fits", "", light, ""))
     rows += small_lights(after) + [row(entry) for entry in of_photographs(refined["photographs"])]
-    untold = f"{ambiguity(light)} {hardly_told_apart(refined.get('alike', []))}".strip()
+    untold = f"{ambiguity(light)} {hardly_told_apart(refined.get('correlations', []))}".strip()
     return Panel(rows, chart(before, after, refined["photographs"]), untold)
 
 
