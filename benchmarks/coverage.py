@@ -96,9 +96,7 @@ def main() -> None:
         rows.append([name, f"{np.abs(error).max():.2g}", f"{np.median(std):.2g}",
                      f"{np.mean(np.abs(error) <= WITHIN * std):.0%} of {len(error)}"])  # fmt: skip
     speed = product_speed(4096, 4096, torch.float32) / 1e9
-    print(
-        f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; {options.count} captures; {' '.join(of_fit)}\n"
-    )
+    print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; {options.count} captures {' '.join(of_fit)}\n")
     print(table(["unknown", "largest error", "stated deviation", "truth within 1.645"], rows), "\n")
     medians = sorted(((float(np.median(values)), pair) for pair, values in correlations.items()), reverse=True)
     print(table(["pair", "correlation"], [[pair, f"{value:.2f}"] for value, pair in medians if value > SHOWN]))
