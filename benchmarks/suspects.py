@@ -66,6 +66,12 @@ def rough(values: np.ndarray, lens: Lens) -> np.ndarray:
     return values * ((1 + 0.25 * (1 - cosine**2) / cosine) / (1 + 0.25 * DARKER))[..., None]
 
 
+def varnished(values: np.ndarray, lens: Lens) -> np.ndarray:
+    """Light with a second, narrow lobe of highlights (Beckmann, roughness 0.1)."""
+    tangent2 = 1 / lens.facing.clip(0.2) ** 2 - 1
+    return values + 0.3 * np.exp(-tangent2 / 0.1**2)[..., None] * (lens.facing < 1)[..., None]
+
+
 def facing(mesh: mi.Scene, pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Cosines (H, W) between the normals of a mesh and rays (3, H, W) in a camera's axes; 1 where there is no mesh."""
     along = np.tensordot(pose[:3, :3], rays, 1).reshape(3, -1).astype(np.float32)
@@ -110,6 +116,8 @@ SUSPECTS = {
     "none": Suspect(),
     "narrow flash": Suspect(radiance=narrow),
     "rough material": Suspect(radiance=rough),
+    "second gloss": Suspect(radiance=varnished),
+    "vignetting": Suspect(radiance=lambda values, lens: values * lens.forward[..., None] ** 4),
     "clipped": Suspect(radiance=lambda values, lens: 3 * values),
     "exposures ± 15 %": Suspect(radiance=lambda values, lens: values * np.exp(0.15 * lens.random.normal())),
     "contrast": Suspect(encoded=lambda v: linear_to_srgb(contrasted(srgb_to_linear(v), 1.4))),
