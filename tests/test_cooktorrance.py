@@ -311,6 +311,20 @@ def test_albedo_of_a_rough_matte_surface_at_its_limits():
     assert aside == pytest.approx(1, abs=2e-3)
 
 
+@pytest.mark.parametrize("sigma", [0.0, 0.6])
+def test_diffuse_reflectance_leaves_highlights_out(sigma):
+    """It is the mean albedo over all viewing directions, whoever looks and however glossy the surface is."""
+    u = np.random.default_rng(4).random((2, 200_000, 2)).astype(np.float32)
+    i, o = (np.array(mi.warp.square_to_cosine_hemisphere(mi.Point2f(*part.T))).T for part in u)
+    i, o = (part[np.minimum(i[:, 2], o[:, 2]) > 0.02] for part in (i, o))
+    matte = cooktorrance([0.2, 0.1, 0.05], 0.0, 0.2, diffuse_roughness=sigma)
+    expected = np.pi * (evaluate(matte, i, o) / i[:, 2:]).mean(0)
+    bsdf = cooktorrance([0.2, 0.1, 0.05], 0.3, 0.2, diffuse_roughness=sigma)
+    for viewer in VIEWERS.values():
+        found = np.array(bsdf.eval_diffuse_reflectance(interaction(viewer[None]))).ravel()
+        np.testing.assert_allclose(found, expected, rtol=0.01)
+
+
 def test_gradient_of_the_diffuse_roughness():
     i, o = directions(300, 25), directions(300, 26)
     bsdf = cooktorrance([0.3, 0.1, 0.02], 0.05, 0.4, diffuse_roughness=0.3)

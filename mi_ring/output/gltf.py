@@ -15,7 +15,7 @@ from mi_ring.errors import InputError
 from mi_ring.images import encoded_picture, linear_to_srgb, to_bytes
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.atlas import Atlas, Texels, rasterise, reflectances, unwrap
-from mi_ring.plugins.matte_reflection import DARKER, MEAN
+from mi_ring.plugins.matte_reflection import mean_albedo
 from mi_ring.plugins.microfacets import MIN_ROUGHNESS
 from mi_ring.scene.mesh_attributes import constant_values
 from mi_ring.scene.visibility import MaskedCamera, visible_points
@@ -121,7 +121,7 @@ class Values:
 def shares(value: Values) -> Shares:
     """Compute what the parts of a `cooktorrance` reflect."""
     rough = value("diffuse_roughness") if "diffuse_roughness" in value else np.zeros(value.count, np.float32)
-    matte = math.pi * value("diffuse", 3) * ((1 + MEAN * rough) / (1 + DARKER * rough))[:, None]
+    matte = math.pi * value("diffuse", 3) * mean_albedo(rough)[:, None]
     lobes = [("specular", "roughness"), ("coat", "coat_roughness")][: 1 + ("coat" in value)]
     gloss = np.stack([4 * value(strength) for strength, _ in lobes], 1)
     widths = np.maximum(np.stack([value(width) for _, width in lobes], 1), MIN_ROUGHNESS)

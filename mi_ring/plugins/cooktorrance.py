@@ -5,7 +5,7 @@ from typing import Any, ClassVar, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mi_ring.plugins.matte_reflection import cosine_factors, rough_lobe, roughened, softened_cosine
+from mi_ring.plugins.matte_reflection import cosine_factors, mean_albedo, rough_lobe, roughened, softened_cosine
 from mi_ring.plugins.microfacets import (
     DISTRIBUTIONS,
     GLOSS_NODES,
@@ -291,6 +291,11 @@ class CookTorrance(mi.BSDF):
 
     def eval(self, ctx, si, wo, active=True):
         return self.reflected(ctx, si, wo, self.parameters(si, active), active)
+
+    def eval_diffuse_reflectance(self, si, active=True):
+        """Compute the mean albedo of the diffuse part, without highlights, as the `aov` integrator shows it."""
+        here = self.parameters(si, active)
+        return dr.select(active, dr.pi * here.diffuse * mean_albedo(here.diffuse_roughness), 0)
 
     def pdf(self, ctx, si, wo, active=True):
         here = self.parameters(si, active)

@@ -45,6 +45,11 @@ def cosine_factors(order):
     return factors[: order + 1]
 
 
+def mean_albedo(sigma):
+    """Return the mean albedo over all viewing directions, relative to Lambert's, at a diffuse roughness `sigma`."""
+    return (1 + MEAN * sigma) / (1 + DARKER * sigma)
+
+
 def roughened(i, o, sigma):
     """Compute the factor of the diffuse reflectance by its roughness `sigma`, for light from `i`, seen from `o`."""
     beside = dr.dot(i, o) - i.z * o.z
