@@ -22,10 +22,10 @@ from mi_ring.capture.pairs import camera_numbers, varies_in_exposure, with_room_
 from mi_ring.errors import InputError
 from mi_ring.fitting.exposure_solver import ExposureSolver
 from mi_ring.fitting.joint_equations import JointEquations
+from mi_ring.fitting.joint_solver import doubt
 from mi_ring.fitting.pose_solver import summed
 from mi_ring.fitting.problem import held_out_photographs
 from mi_ring.fitting.refinement import refined_of
-from mi_ring.fitting.room_solver import doubt
 from mi_ring.images import read_image
 from mi_ring.metrics.capture_findings import measure
 from mi_ring.rendering.image_formation import render_photographs

@@ -17,6 +17,7 @@ from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import unfold
 from mi_ring.fitting.exposure_solver import ExposureSolver
 from mi_ring.fitting.iteration import Iteration
+from mi_ring.fitting.joint_solver import SOLVED, solve_jointly
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.muon import Muon
 from mi_ring.fitting.nan_guard import NanGuard
@@ -24,7 +25,6 @@ from mi_ring.fitting.pose_solver import PoseSolver
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import START, finds_small_lights
 from mi_ring.fitting.renderer import Renderer
-from mi_ring.fitting.room_solver import solve_room
 from mi_ring.fitting.schedule import Rate, Schedule, Stepper, learning_rate
 from mi_ring.fitting.small_lights import find_lobes
 from mi_ring.objects.fitted_object import FittedObject
@@ -191,20 +191,23 @@ class Optimisation:
             self.guard.keep()  # so that a retreat does not restore the old equations
 
     def find_light(self, renderer: Renderer, schedule: Schedule, iteration: int, capture: Capture) -> None:
-        """Find the room beside other light, or the lobes of a room alone, if it is time.
+        """Find a room beside other light, flash and exposures together, or the lobes of a room alone, if it is time.
 
         `iteration`: the next one, from 0. `capture`: that of the problem, with the masks that are used now.
         """
         calibration, problem = self.model.calibration, replace(self.problem, capture=capture)
-        if calibration is None or "ambient" not in calibration.refined:
+        if calibration is None or not {"ambient", *SOLVED} & {*calibration.refined}:
             return
         level, progress = schedule.stage(iteration).level, schedule.progress(iteration)
         one_material = progress < problem.lighting.one_material_until  # the joint equations have many
-        if schedule.room_due(iteration) and not (calibration.follows_room or one_material):
-            room = problem.processes.on_first(lambda: solve_room(problem, self.model, renderer, level))
-            if room is None:
-                return
-            calibration.room.harmonics.copy_(torch.from_numpy(room))
+        if schedule.joint_due(iteration) and not (calibration.room.alone or one_material):
+            values = problem.processes.on_first(lambda: solve_jointly(problem, self.model, renderer, level))
+            for name, value in values.items():
+                tensor = calibration.room.harmonics if name == "ambient" else calibration.get_parameter(name)
+                tensor.data.copy_(value)
+            for solver in self.solvers:
+                if isinstance(solver, ExposureSolver):
+                    solver.measured.zero_()  # it was measured beside other light
         elif schedule.lights_due(iteration) and finds_small_lights(calibration, problem.config):
             found = problem.processes.on_first(lambda: find_lobes(problem, self.model, renderer, level, iteration))
             if found is None:

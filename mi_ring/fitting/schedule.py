@@ -16,7 +16,7 @@ RAMP = 0.05  #: progress in which a learning rate rises from 0 to full, after it
 MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they are refined
 #: Progress at which small lights of an unknown room are sought: when harmonics have their full order, and later.
 LIGHTS_SOUGHT = 0.36, 0.5, 0.65, 0.8
-ROOM_SOLVED = 0.4, 0.6  #: progress at which a fit estimates the light of a room beside a flash
+JOINTLY_SOLVED = 0.3, 0.6  #: progress at which a room beside other light, flash and exposures are found together
 COAT_DECIDED = 0.5  #: progress at which a fit decides about a second lobe of highlights
 EARLIEST = (
     20  #: iterations before light is sought or a coat decided: shorter fits know too little of surface and material
@@ -110,9 +110,9 @@ class Schedule:
         """Test whether small lights are sought before `iteration`, counted from 0, if the fit seeks any."""
         return iteration >= EARLIEST and iteration in [int(progress * self.shaping) for progress in LIGHTS_SOUGHT]
 
-    def room_due(self, iteration: int) -> bool:
-        """Test whether a room beside a flash is estimated before `iteration`, counted from 0, if it is refined."""
-        return iteration >= EARLIEST and iteration in [int(progress * self.shaping) for progress in ROOM_SOLVED]
+    def joint_due(self, iteration: int) -> bool:
+        """Test whether lights and exposures are found together before `iteration`, counted from 0."""
+        return iteration >= EARLIEST and iteration in [int(progress * self.shaping) for progress in JOINTLY_SOLVED]
 
     def coat_due(self, iteration: int) -> bool:
         """Test whether the fit decides before `iteration`, counted from 0, whether the material has a coat."""

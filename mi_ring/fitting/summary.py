@@ -10,9 +10,9 @@ from mi_ring.calibration.unknown import Found
 from mi_ring.calibration.unknowns import Exposure
 from mi_ring.capture.capture import Capture
 from mi_ring.fitting.joint_equations import JointEquations
+from mi_ring.fitting.joint_solver import doubt
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
-from mi_ring.fitting.room_solver import doubt
 
 
 @torch.no_grad()

@@ -1,0 +1,88 @@
+"""Finds lights and exposures, by least squares in which surface, material and all of calibration are unknown, too.
+
+As long as a fit does not know of a room, surface, material and powers explain its light. As long as it does not know
+the powers, the surface that single photographs see best explains a part of them. So the errors of a prediction show
+hardly anything of either. The joint equations tell what explains all photographs together.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mi_ring.calibration.calibration import Calibration
+from mi_ring.fitting.comparison import ROOM
+from mi_ring.fitting.joint_equations import JointEquations
+from mi_ring.fitting.model import Model
+from mi_ring.fitting.problem import Problem
+from mi_ring.fitting.renderer import Renderer
+
+DOUBT = 0.03  #: share of the flash that a room seems to have where the true reflectance is not one of the model's
+SOLVED = "light", "power", "gain"  #: unknowns that are solved for beside the room
+MOST = 40  #: photographs that are compared for what they share: more hardly tell more, and take longer
+FAINT = 0.01  #: least brightness of a room for the next number [exposure]
+SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share of the first
+
+
+@torch.no_grad()
+def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Tensor]:
+    """Find the room beside other light, and the refined ones of `SOLVED`. Returns new values of the calibration.
+
+    They are a dict from names of unknowns to tensors in the shape of the unknown, in units of its prior; of "ambient"
+    the harmonics (BASIS, 3), of which a part is `believed`. It is empty if the photographs do not tell. Renders the
+    surface at a `level` of the mesh. The calibration does not change.
+    """
+    calibration = model.calibration
+    assert calibration is not None
+    room, names = calibration.room, [name for name in SOLVED if name in calibration.unknowns]
+    many = {"power", "gain"} & {*names}  # of each photograph one
+    joint = JointEquations.of(problem, model, renderer, level, None if many else MOST)
+    layout, unit = joint.layout, ROOM * problem.exposure
+    here = layout.places("ambient")
+    given, now = (part.double().numpy(force=True) for part in (room.given, room.harmonics))
+    current = layout.values()
+    current[here] = (now - given)[layout.room].ravel() / unit
+    right, precision = joint.vector + joint.matrix @ current, np.ones(layout.count)
+    if not np.isfinite(right).all():
+        return {}
+    solution = np.linalg.solve(joint.matrix + np.diag(precision), right)
+    result = {}
+    if layout.room:
+        bright = max(float((given[0] + unit * solution[here[:3]]).mean()), FAINT * problem.exposure)
+        precision[here[3:]] = (unit / (SIDES * bright)) ** 2
+        covariance = np.linalg.inv(joint.matrix + np.diag(precision))
+        solution = covariance @ right
+        more, deviation = np.zeros_like(given), np.zeros_like(given)
+        more[layout.room] = unit * solution[here].reshape(-1, 3)
+        deviation[0] = unit * np.sqrt(np.diag(covariance)[here[:3]])
+        found = given + believed(calibration, more, deviation) * more
+        found[:, found[0] < 0] = 0  # a room with negative mean radiance is impossible
+        result["ambient"] = torch.from_numpy(found)
+    solution = layout.centring() @ solution
+    for name in names:
+        shape = calibration.get_parameter(name).shape
+        result[name] = torch.from_numpy(solution[layout.places(name)].reshape(shape))
+    return result
+
+
+def believed(calibration: Calibration, more: np.ndarray, deviation: np.ndarray) -> float:
+    """Return the share, 0 to 1, of found room light that a fit uses.
+
+    `more` (BASIS, 3): the light that was found beyond that of the capture. `deviation` (BASIS, 3): standard deviation
+    of its first harmonic. The share is 1 − error² / light², as in "Estimation with quadratic loss" (James and Stein
+    1961). The error has three parts: the deviation, the difference of the colours, and `doubt`.
+    """
+    if (least := doubt(calibration)) == 0:
+        return 1.0
+    light, error = (calibration.room_share(torch.from_numpy(part)).double() for part in (more, deviation))
+    mean = float(light.mean())
+    variance = float(error.mean()) ** 2 + float(light.var()) / 3 + least**2
+    return max(0.0, 1 - variance / mean**2) if mean > 0 else 0.0
+
+
+def doubt(calibration: Calibration) -> float:
+    """Return the share of the flash below which a room is not believed.
+
+    It is 0 if the scene tells of harmonics of a room, and if some or all photographs have no light of their own.
+    """
+    certain = calibration.room.given.any() or not calibration.rig.lit.all()
+    return 0.0 if certain else DOUBT
