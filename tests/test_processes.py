@@ -47,11 +47,11 @@ def step(fit):
         return total
 
     optimisation.backward = noting
-    fit.course.iteration = fit.iterations // 2
+    fit.course.iteration = next(k for k in reversed(range(fit.iterations)) if fit.schedule.joint_due(k))
     it = fit.step()
     exposure, brightness, pose = optimisation.solvers
     found |= {"powers": exposure.measured, "curvature": pose.seen[1], "brightness": brightness.moments,
-              "room": calibration.room.vector, "loss": torch.tensor(it.loss),
+              "room": calibration.room.harmonics, "loss": torch.tensor(it.loss),
               "terms": torch.tensor([it.terms.get(name, 0.0) for name in fit.loss.terms]),
               "unexplained": torch.tensor(it.unexplained()),
               "averages": torch.stack([picture for _, picture in fit.renderer.averages.values()]),
