@@ -63,6 +63,30 @@ def test_a_room_is_believed_by_its_share_and_by_its_colours(small_capture, monke
     assert found[0, :2].all() and not found[:, 2].any()  # no colour of a room is darker than black
 
 
+def test_all_else_is_found_beside_the_room_that_is_believed(small_capture, monkeypatch):
+    """By the formula of a conditional mean, where a faint room and the powers look alike."""
+    fit = fit_of(small_capture)
+    layout = Layout(fit.model.calibration)
+    random = np.random.default_rng(5)
+    slopes = random.normal(size=(3 * layout.count, layout.count))
+    slopes[:, layout.places("power")] += 2 * slopes[:, layout.places("ambient")[:1]]
+    matrix = 1e5 * slopes.T @ slopes
+    truth = 0.3 * random.normal(size=layout.count)
+    truth[layout.places("ambient")] = (
+        room_like(fit, 0.02, 0.02, 0.02)[layout.room].ravel() / ROOM / fit.problem.exposure
+    )
+    monkeypatch.setattr(JointEquations, "of", lambda *_: JointEquations(layout, matrix, matrix @ truth))
+    found = solve_jointly(fit.problem, fit.model, fit.renderer, 2)
+    assert not found["ambient"].any()
+    power, room = layout.places("power"), layout.places("ambient")
+    expected = truth.copy()
+    own = matrix[np.ix_(power, power)] + np.eye(len(power))
+    expected[power] = np.linalg.solve(own, (matrix @ truth)[power])  # the room is 0
+    np.testing.assert_allclose(found["power"].ravel(), (layout.centring() @ expected)[power], atol=1e-5)
+    assert np.abs(found["power"].numpy().ravel() - (layout.centring() @ truth)[power]).max() > 1e-4
+    assert len(room) + len(power) == layout.count
+
+
 def test_what_the_scene_file_tells_of_a_room_may_be_more_or_less(small_capture, monkeypatch):
     given = np.zeros((BASIS, 3))
     given[0] = 1.0

@@ -44,19 +44,23 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
     right, precision = joint.vector + joint.matrix @ current, np.ones(layout.count)
     if not np.isfinite(right).all():
         return {}
-    solution = np.linalg.solve(joint.matrix + np.diag(precision), right)
     result = {}
+    solution = np.linalg.solve(joint.matrix + np.diag(precision), right)
     if layout.room:
         bright = max(float((given[0] + unit * solution[here[:3]]).mean()), FAINT * problem.exposure)
         precision[here[3:]] = (unit / (SIDES * bright)) ** 2
         covariance = np.linalg.inv(joint.matrix + np.diag(precision))
-        solution = covariance @ right
         more, deviation = np.zeros_like(given), np.zeros_like(given)
-        more[layout.room] = unit * solution[here].reshape(-1, 3)
+        more[layout.room] = unit * (covariance @ right)[here].reshape(-1, 3)
         deviation[0] = unit * np.sqrt(np.diag(covariance)[here[:3]])
         found = given + believed(calibration, more, deviation) * more
         found[:, found[0] < 0] = 0  # a room with negative mean radiance is impossible
         result["ambient"] = torch.from_numpy(found)
+        # All else beside the room that is believed.
+        solution[here] = (found - given)[layout.room].ravel() / unit
+        rest = np.setdiff1d(np.arange(layout.count), here)
+        system, beside = joint.matrix[np.ix_(rest, rest)], joint.matrix[np.ix_(rest, here)]
+        solution[rest] = np.linalg.solve(system + np.eye(len(rest)), right[rest] - beside @ solution[here])
     solution = layout.centring() @ solution
     for name in names:
         shape = calibration.get_parameter(name).shape
