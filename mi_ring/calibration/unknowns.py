@@ -93,6 +93,8 @@ class Distortion(Unknown):
 class LightPlace(Unknown):
     """Offset of each light's position [median distance of cameras and object]; of a distant light's direction [rad]."""
 
+    doubt = 0.002
+
     def width_for(self, rig: Rig) -> float:
         return self.width * (VAGUE if rig.guessed else 1.0)
 
@@ -137,6 +139,7 @@ class Exposure(Unknown):
 class Power(Exposure):
     """Logarithm of a factor of the strength of each photograph's own light, for each colour channel."""
 
+    doubt = 0.01
     changes = "light"
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:

@@ -74,13 +74,15 @@ class JointEquations:
         """Return the standard deviation of each refined unknown of the calibration.
 
         They are a dict from names of unknowns to arrays in the shape and the unit of the unknown. The room's light is
-        "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. `exposure`: that of the problem.
+        "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. `exposure`: that of the problem. The
+        deviations include the `doubt` of unknowns.
         """
         layout, spread = self.layout, np.sqrt(np.diag(self.covariance()))
         result = {}
         for name, width in layout.calibration.widths.items():
-            shape = getattr(layout.calibration, name).shape
-            result[name] = width * spread[layout.places(name)].reshape(shape)
+            shape, doubt = getattr(layout.calibration, name).shape, layout.calibration.unknowns[name].doubt
+            told = np.hypot(width * spread[layout.places(name)], doubt)
+            result[name] = np.minimum(told, width).reshape(shape)
         if layout.room:
             result["ambient"] = ROOM * exposure * spread[layout.places("ambient")][:3]
         return result
