@@ -120,6 +120,7 @@ class Exposure(Unknown):
     It is 0 for photographs that are held out, and for those whose factor is known: see `Rig.exposed`.
     """
 
+    doubt = 0.01
     solved = True
 
     def concerns(self, rig: Rig, lit: bool) -> bool:
@@ -139,7 +140,6 @@ class Exposure(Unknown):
 class Power(Exposure):
     """Logarithm of a factor of the strength of each photograph's own light, for each colour channel."""
 
-    doubt = 0.01
     changes = "light"
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:

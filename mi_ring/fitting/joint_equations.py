@@ -39,13 +39,14 @@ class JointEquations:
     @classmethod
     @torch.no_grad()
     def of(
-        cls, problem: Problem, model: Model, renderer: Renderer, level: int, most: int | None = None
-    ) -> "JointEquations":
+        cls, problem: Problem, model: Model, renderer: Renderer, level: int, most: int | None = None,
+        width: int = COMPARED_WIDTH,
+    ) -> "JointEquations":  # fmt: skip
         """Render fitted photographs from the current model, and compare them with the photographs.
 
-        `most`: how many with a light of their own, and how many without, at most, evenly spaced; None: all. `level` of
-        the mesh: at most `LEVEL` is rendered. Colours and silhouettes eliminate the surface separately, so its prior
-        counts twice.
+        `most`: of those with a light of their own, and of those without, at most so many are rendered, evenly spaced;
+        None: all. `level` of the mesh: at most `LEVEL` is rendered. `width`: largest width of the pictures [px].
+        Colours and silhouettes eliminate the surface separately, so its prior counts twice.
         """
         calibration, ring = model.calibration, model.ring
         assert calibration is not None
@@ -58,7 +59,7 @@ class JointEquations:
         kinds = [problem.fitted[lit == kind] for kind in (True, False)]
         kinds = [kind[evenly_spaced(len(kind), most or len(kind))] for kind in kinds if len(kind)]
         for index in (some for kind in kinds for some in problem.capture.together(kind)):
-            scale = -(-problem.capture.shots[index[0]].size[0] // COMPARED_WIDTH)
+            scale = -(-problem.capture.shots[index[0]].size[0] // width)
             group = Group(problem, calibration, surface, patches, ring.indirect, index, scale)
             compare(group, layout, colours, silhouettes)
         calibration.relight(surface)  # as it was
@@ -81,6 +82,7 @@ class JointEquations:
         result = {}
         for name, width in layout.calibration.widths.items():
             shape, doubt = getattr(layout.calibration, name).shape, layout.calibration.unknowns[name].doubt
+            # What is not told, such as how far the flash is ahead, is known as well as before.
             told = np.hypot(width * spread[layout.places(name)], doubt)
             result[name] = np.minimum(told, width).reshape(shape)
         if layout.room:

@@ -1,8 +1,8 @@
-"""Finds lights and exposures, by least squares in which surface, material and all of calibration are unknown, too.
+"""Finds room, flash and exposures, by least squares in which surface and material are unknown, too.
 
 As long as a fit does not know of a room, surface, material and powers explain its light. As long as it does not know
-the powers, the surface that single photographs see best explains a part of them. So the errors of a prediction show
-hardly anything of either. The joint equations tell what explains all photographs together.
+the powers, the surface explains a part of them, where few photographs see it. So the errors of a prediction show hardly
+anything of either. The joint equations tell what explains all photographs together.
 """
 
 import numpy as np
@@ -15,39 +15,44 @@ from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.model import Model
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
+from mi_ring.scene.lights import shared_emitters
 
 DOUBT = 0.03  #: share of the flash that a room seems to have where the true reflectance is not one of the model's
 SOLVED = "light", "power", "gain"  #: unknowns that are solved for beside the room
-MOST = 40  #: photographs that are compared for what they share: more hardly tell more, and take longer
+WIDTH = 64  #: of the compared pictures [px]
+MOST = 40  #: photographs that are compared for the room alone: more hardly tell more, and take longer
 FAINT = 0.01  #: least brightness of a room for the next number [exposure]
 SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share of the first
 
 
 @torch.no_grad()
 def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Tensor]:
-    """Find the room beside other light, and the refined ones of `SOLVED`. Returns new values of the calibration.
+    """Find the room beside other light and, of photographs with a flash alone, the refined ones of `SOLVED`.
 
-    They are a dict from names of unknowns to tensors in the shape of the unknown, in units of its prior; of "ambient"
-    the harmonics (BASIS, 3), of which a part is `believed`. It is empty if the photographs do not tell. Renders the
-    surface at a `level` of the mesh. The calibration does not change.
+    Returns new values of the calibration: a dict from names of unknowns to tensors in the shape of the unknown, in
+    units of its prior; of "ambient" the harmonics (BASIS, 3), of which a part is `believed`. It is empty if no
+    photographs can be compared. Renders the surface at a `level` of the mesh. The calibration does not change.
     """
     calibration = model.calibration
     assert calibration is not None
-    room, names = calibration.room, [name for name in SOLVED if name in calibration.unknowns]
-    many = {"power", "gain"} & {*names}  # of each photograph one
-    joint = JointEquations.of(problem, model, renderer, level, None if many else MOST)
+    room, rig = calibration.room, calibration.rig
+    # With other lights the derivatives by a power would be those of all light.
+    alone = rig.flash is not None and rig.lit.all() and not shared_emitters(problem.capture.scene)
+    names = [name for name in SOLVED if name in calibration.unknowns and alone]
+    most = None if {"power", "gain"} & {*names} else MOST
+    joint = JointEquations.of(problem, model, renderer, level, most, WIDTH)
     layout, unit = joint.layout, ROOM * problem.exposure
     here = layout.places("ambient")
     given, now = (part.double().numpy(force=True) for part in (room.given, room.harmonics))
     current = layout.values()
     current[here] = (now - given)[layout.room].ravel() / unit
     right, precision = joint.vector + joint.matrix @ current, np.ones(layout.count)
-    if not np.isfinite(right).all():
+    if not joint.matrix.any() or not np.isfinite(right).all():
         return {}
-    result = {}
-    solution = np.linalg.solve(joint.matrix + np.diag(precision), right)
+    result, solution = {}, current.copy()
     if layout.room:
-        bright = max(float((given[0] + unit * solution[here[:3]]).mean()), FAINT * problem.exposure)
+        first = np.linalg.solve(joint.matrix + np.diag(precision), right)[here[:3]]
+        bright = max(float((given[0] + unit * first).mean()), FAINT * problem.exposure)
         precision[here[3:]] = (unit / (SIDES * bright)) ** 2
         covariance = np.linalg.inv(joint.matrix + np.diag(precision))
         more, deviation = np.zeros_like(given), np.zeros_like(given)
@@ -56,12 +61,13 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
         found = given + believed(calibration, more, deviation) * more
         found[:, found[0] < 0] = 0  # a room with negative mean radiance is impossible
         result["ambient"] = torch.from_numpy(found)
-        # All else beside the room that is believed.
         solution[here] = (found - given)[layout.room].ravel() / unit
-        rest = np.setdiff1d(np.arange(layout.count), here)
-        system, beside = joint.matrix[np.ix_(rest, rest)], joint.matrix[np.ix_(rest, here)]
-        solution[rest] = np.linalg.solve(system + np.eye(len(rest)), right[rest] - beside @ solution[here])
-    solution = layout.centring() @ solution
+    if names:  # beside the room that is believed, and all else as it is
+        own = np.concatenate([layout.places(name) for name in names])
+        others = np.setdiff1d(np.arange(layout.count), own)
+        system, beside = joint.matrix[np.ix_(own, own)], joint.matrix[np.ix_(own, others)]
+        solution[own] = np.linalg.solve(system + np.eye(len(own)), right[own] - beside @ solution[others])
+        solution = layout.centring() @ solution
     for name in names:
         shape = calibration.get_parameter(name).shape
         result[name] = torch.from_numpy(solution[layout.places(name)].reshape(shape))
@@ -86,7 +92,7 @@ def believed(calibration: Calibration, more: np.ndarray, deviation: np.ndarray) 
 def doubt(calibration: Calibration) -> float:
     """Return the share of the flash below which a room is not believed.
 
-    It is 0 if the scene tells of harmonics of a room, and if some or all photographs have no light of their own.
+    It is 0 if the scene tells of harmonics of a room, or if photographs have no light of their own.
     """
     certain = calibration.room.given.any() or not calibration.rig.lit.all()
     return 0.0 if certain else DOUBT

@@ -199,15 +199,19 @@ class Optimisation:
         if calibration is None or not {"ambient", *SOLVED} & {*calibration.refined}:
             return
         level, progress = schedule.stage(iteration).level, schedule.progress(iteration)
-        one_material = progress < problem.lighting.one_material_until  # the joint equations have many
+        one_material = progress < problem.lighting.one_material_until  # the joint equations have many materials
         if schedule.joint_due(iteration) and not (calibration.room.alone or one_material):
             values = problem.processes.on_first(lambda: solve_jointly(problem, self.model, renderer, level))
+            if not values:
+                return
             for name, value in values.items():
                 tensor = calibration.room.harmonics if name == "ambient" else calibration.get_parameter(name)
                 tensor.data.copy_(value)
-            for solver in self.solvers:
-                if isinstance(solver, ExposureSolver):
-                    solver.measured.zero_()  # it was measured beside other light
+                for optimizer in self.optimizers:
+                    if isinstance(optimizer, ExposureSolver) and optimizer.tensor is tensor:
+                        optimizer.measured.zero_()  # it was measured beside another surface
+                    else:
+                        optimizer.state.pop(tensor, None)  # it leads away from another value
         elif schedule.lights_due(iteration) and finds_small_lights(calibration, problem.config):
             found = problem.processes.on_first(lambda: find_lobes(problem, self.model, renderer, level, iteration))
             if found is None:

@@ -18,9 +18,8 @@ MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they ar
 LIGHTS_SOUGHT = 0.36, 0.5, 0.65, 0.8
 JOINTLY_SOLVED = 0.3, 0.6  #: progress at which a room beside other light, flash and exposures are found together
 COAT_DECIDED = 0.5  #: progress at which a fit decides about a second lobe of highlights
-EARLIEST = (
-    20  #: iterations before light is sought or a coat decided: shorter fits know too little of surface and material
-)
+#: Iterations before light is sought or a coat decided: in shorter fits surface and material are too wrong.
+EARLIEST = 20
 INITIAL_BLUR = 0.06  #: standard deviation of the silhouettes' blur at the start, as a share of the width
 SHARP = 0.8  #: progress at which the blur of silhouettes has shrunk to one pixel
 
