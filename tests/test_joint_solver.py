@@ -71,10 +71,9 @@ def test_all_else_is_found_beside_the_room_that_is_believed(small_capture, monke
     slopes = random.normal(size=(3 * layout.count, layout.count))
     slopes[:, layout.places("power")] += 2 * slopes[:, layout.places("ambient")[:1]]
     matrix = 1e5 * slopes.T @ slopes
-    truth = 0.3 * random.normal(size=layout.count)
-    truth[layout.places("ambient")] = (
-        room_like(fit, 0.02, 0.02, 0.02)[layout.room].ravel() / ROOM / fit.problem.exposure
-    )
+    truth = 1.5 * random.normal(size=layout.count)  # of 10 % each
+    faint = room_like(fit, 0.02, 0.02, 0.02)[layout.room]
+    truth[layout.places("ambient")] = faint.ravel() / (ROOM * fit.problem.exposure)
     monkeypatch.setattr(JointEquations, "of", lambda *_: JointEquations(layout, matrix, matrix @ truth))
     found = solve_jointly(fit.problem, fit.model, fit.renderer, 2)
     assert not found["ambient"].any()
@@ -85,6 +84,9 @@ def test_all_else_is_found_beside_the_room_that_is_believed(small_capture, monke
     np.testing.assert_allclose(found["power"].ravel(), (layout.centring() @ expected)[power], atol=1e-5)
     assert np.abs(found["power"].numpy().ravel() - (layout.centring() @ truth)[power]).max() > 1e-4
     assert len(room) + len(power) == layout.count
+    truth[power] *= 0.1  # powers that hardly differ are left to the quarters of photographs
+    monkeypatch.setattr(JointEquations, "of", lambda *_: JointEquations(layout, matrix, matrix @ truth))
+    assert [*solve_jointly(fit.problem, fit.model, fit.renderer, 2)] == ["ambient"]
 
 
 def test_what_the_scene_file_tells_of_a_room_may_be_more_or_less(small_capture, monkeypatch):
@@ -97,10 +99,10 @@ def test_what_the_scene_file_tells_of_a_room_may_be_more_or_less(small_capture, 
 
 
 def test_a_room_is_found_that_material_and_powers_explain(small_capture, monkeypatch):
-    """Photographs show less flash than is predicted, by a factor that differs; a room makes up for it."""
+    """Photographs show another flash than is predicted, by a factor that differs, and a room."""
     fit = fit_of(small_capture, levels=(3,), widths=(56,), shares=(1.0,))
     truth = room_like(fit, 0.2, 0.25, 0.3)
-    compare, factors = joint_equations.compare, torch.linspace(0.75, 0.9, 12)
+    compare, factors = joint_equations.compare, torch.linspace(0.75, 1.2, 12)
 
     def with_room(group, *others):
         lit, coverage = group.direct()
@@ -125,7 +127,7 @@ def test_a_room_is_found_that_material_and_powers_explain(small_capture, monkeyp
     assert np.corrcoef(found[1:4].ravel(), truth[1:4].ravel())[0, 1] > 0.9
     assert not found[PER_FRAME:].any()
     expected = factors.log() - factors.log().mean()
-    np.testing.assert_allclose(power, expected[:, None].expand(12, 3), atol=0.04)  # from 0.09
+    assert np.corrcoef(power.mean(1), expected)[0, 1] > 0.9 and power.std() > 0.5 * expected.std()
 
 
 def test_a_fit_solves_for_it_twice(small_capture, monkeypatch):

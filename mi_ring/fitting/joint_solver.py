@@ -21,13 +21,16 @@ DOUBT = 0.03  #: share of the flash that a room seems to have where the true ref
 SOLVED = "light", "power", "gain"  #: unknowns that are solved for beside the room
 WIDTH = 64  #: of the compared pictures [px]
 MOST = 40  #: photographs that are compared for the room alone: more hardly tell more, and take longer
+#: Standard deviation of powers or gains from which they and the flash are taken from the solution. Smaller ones may be
+#: errors of cameras and masks, which `ExposureSolver` tells by quarters of photographs.
+LARGE = 0.05
 FAINT = 0.01  #: least brightness of a room for the next number [exposure]
 SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share of the first
 
 
 @torch.no_grad()
 def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Tensor]:
-    """Find the room beside other light and, of photographs with a flash alone, the refined ones of `SOLVED`.
+    """Find the room beside other light and, if a flash alone varies much, the refined ones of `SOLVED`.
 
     Returns new values of the calibration: a dict from names of unknowns to tensors in the shape of the unknown, in
     units of its prior; of "ambient" the harmonics (BASIS, 3), of which a part is `believed`. It is empty if no
@@ -68,9 +71,10 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
         system, beside = joint.matrix[np.ix_(own, own)], joint.matrix[np.ix_(own, others)]
         solution[own] = np.linalg.solve(system + np.eye(len(own)), right[own] - beside @ solution[others])
         solution = layout.centring() @ solution
-    for name in names:
-        shape = calibration.get_parameter(name).shape
-        result[name] = torch.from_numpy(solution[layout.places(name)].reshape(shape))
+    values = {name: solution[layout.places(name)].reshape(calibration.get_parameter(name).shape) for name in names}
+    vary = [calibration.widths[name] * values[name].std(0).max() for name in ("power", "gain") if name in names]
+    if max(vary, default=0.0) >= LARGE:
+        result |= {name: torch.from_numpy(value) for name, value in values.items()}
     return result
 
 
