@@ -87,7 +87,7 @@ def main() -> None:
     for k in range(options.count):
         mesh, material = (names[k % len(names)] for names in (options.meshes, options.materials))
         folder = synthesized(mesh, material, k, options.out / str(k))
-        out = folder / "-".join(["fit", *of_fit])
+        out = folder / "-".join(["fit", *of_fit]).replace("/", "_")
         for pair in fitted(folder / "scene.xml", out, ["--preset", "fast", *of_fit])["correlations"]:
             correlations.setdefault(" and ".join(sorted(pair["options"])), []).append(pair["value"])
         for name, both in errors(folder, out).items():
