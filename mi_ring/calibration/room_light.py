@@ -26,10 +26,11 @@ LOBE_RIDGE = 1e-3  #: ridge of a lobe's flux toward 0, relative to its own diago
 
 
 class RoomLight(nn.Module):
-    """Room light as an unknown: harmonics and lobes, and the normal equations that determine their strengths.
+    """Room light as an unknown: harmonics and lobes.
 
-    The rows of the equations are those of `Photographs.room_strengths`. Directions and sharpness of lobes are trained
-    by gradients, if there is no other light. Otherwise lobes stay as given.
+    If it alone lights photographs, normal equations determine their strengths, in rows like those of
+    `Photographs.room_strengths`, and directions and sharpness of lobes are trained by gradients. Beside other light a
+    fit sets the harmonics as a whole, and lobes stay as given.
     """
 
     given: Tensor  #: (BASIS, 3) from the capture
@@ -184,7 +185,7 @@ class RoomLight(nn.Module):
             return
         free = self.free if progress >= FINE else harmonics_up_to(BESIDE_FLASH, self.frames)
         self.harmonics = self.given.clone()
-        if self.alone and (count := int(self.count)):
+        if count := int(self.count):
             self.log_sharpness.clamp_(*map(math.log, SHARPNESS))
             found = self.solved_with_lobes(self.matrix, self.vector, free, count)
             self.harmonics[free], self.flux[:count] = found

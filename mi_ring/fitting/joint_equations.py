@@ -7,6 +7,7 @@ of the matrix (the same, section 8.1).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -66,8 +67,9 @@ class JointEquations:
         (matrix, vector), (more, shift) = (part.without_patches() for part in (colours, silhouettes))
         return cls(layout, matrix + more, vector + shift)
 
+    @cached_property
     def covariance(self) -> np.ndarray:
-        """Compute the covariance (N, N) of all parameters with their priors. Powers and gains have mean 1."""
+        """The covariance (N, N) of all parameters with their priors. Powers and gains have mean 1."""
         centring = self.layout.centring()
         return centring @ np.linalg.inv(np.eye(self.layout.count) + self.matrix) @ centring.T
 
@@ -78,7 +80,7 @@ class JointEquations:
         "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. `exposure`: that of the problem. The
         deviations include the `doubt` of unknowns.
         """
-        layout, spread = self.layout, np.sqrt(np.diag(self.covariance()))
+        layout, spread = self.layout, np.sqrt(np.diag(self.covariance))
         result = {}
         for name, width in layout.calibration.widths.items():
             shape, doubt = getattr(layout.calibration, name).shape, layout.calibration.unknowns[name].doubt
@@ -95,7 +97,7 @@ class JointEquations:
         It is the largest canonical correlation ("Relations between two sets of variates", Hotelling 1936). Of the room
         the first harmonic counts. Poses are left out: they always look like another surface.
         """
-        layout, covariance = self.layout, self.covariance()
+        layout, covariance = self.layout, self.covariance
         at: dict[str, list[int]] = {}
         for name, unknown in layout.calibration.unknowns.items():
             at.setdefault(unknown.option, []).extend(layout.places(name))

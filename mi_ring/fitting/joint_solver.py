@@ -30,7 +30,7 @@ SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share 
 
 @torch.no_grad()
 def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Tensor]:
-    """Find the room beside other light and, if a flash alone varies much, the refined ones of `SOLVED`.
+    """Find the room beside other light. If a flash is the only other light and varies, find those of `SOLVED`, too.
 
     Returns new values of the calibration: a dict from names of unknowns to tensors in the shape of the unknown, in
     units of its prior; of "ambient" the harmonics (BASIS, 3), of which a part is `believed`. It is empty if no

@@ -195,9 +195,10 @@ class Optimisation:
 
         `iteration`: the next one, from 0. `capture`: that of the problem, with the masks that are used now.
         """
-        calibration, problem = self.model.calibration, replace(self.problem, capture=capture)
+        calibration = self.model.calibration
         if calibration is None or not {"ambient", *SOLVED} & {*calibration.refined}:
             return
+        problem = replace(self.problem, capture=capture)
         level, progress = schedule.stage(iteration).level, schedule.progress(iteration)
         one_material = progress < problem.lighting.one_material_until  # the joint equations have many materials
         if schedule.joint_due(iteration) and not (calibration.room.alone or one_material):

@@ -101,17 +101,21 @@ class Schedule:
         """Level of the icosphere in the last stage."""
         return self.stages[-1].level
 
+    def reaches(self, marks: Sequence[float], iteration: int) -> bool:
+        """Test whether `iteration`, counted from 0, is the first one at one of these marks of progress."""
+        return iteration in [int(mark * self.shaping) for mark in marks]
+
     def masks_due(self, iteration: int) -> bool:
         """Test whether masks are refined before `iteration`, counted from 0, if the fit refines masks."""
-        return iteration in [int(progress * self.shaping) for progress in MASKS_REFINED]
+        return self.reaches(MASKS_REFINED, iteration)
 
     def lights_due(self, iteration: int) -> bool:
         """Test whether small lights are sought before `iteration`, counted from 0, if the fit seeks any."""
-        return iteration >= EARLIEST and iteration in [int(progress * self.shaping) for progress in LIGHTS_SOUGHT]
+        return iteration >= EARLIEST and self.reaches(LIGHTS_SOUGHT, iteration)
 
     def joint_due(self, iteration: int) -> bool:
-        """Test whether lights and exposures are found together before `iteration`, counted from 0."""
-        return iteration >= EARLIEST and iteration in [int(progress * self.shaping) for progress in JOINTLY_SOLVED]
+        """Test whether lights and exposures are found together before `iteration`, if any of them is refined."""
+        return iteration >= EARLIEST and self.reaches(JOINTLY_SOLVED, iteration)
 
     def coat_due(self, iteration: int) -> bool:
         """Test whether the fit decides before `iteration`, counted from 0, whether the material has a coat."""
