@@ -1,11 +1,11 @@
 """Do the standard deviations of calibration cover the truth? Small captures with known truth are made and fitted.
 
     python benchmarks/coverage.py MESH … [--out out/coverage] [--count 20] [--materials MATERIAL …]
-                                  [OPTIONS OF mi-ring fit]
+                                  [--curve EXPONENT CONTRAST TOE] [OPTIONS OF mi-ring fit]
 
 Capture number k shows MESH and MATERIAL number k, in turn. The flash is beside the place that the scene file says, and
 its power varies. About every other capture has a room, brighter from some sides, of which the scene file knows nothing.
-Each is fitted by `fast`.
+With --curve, photographs have another tone curve than sRGB. Each is fitted by `fast`.
 
 Prints a Markdown table with machine and date: of each unknown the largest error, the median of the stated standard
 deviations, and how often the truth is within 1.645 of them, which is nine times of ten if they are right; then the
@@ -24,10 +24,14 @@ import numpy as np
 import torch
 from accuracy import processor, product_speed, table
 from halves import fitted
+from PIL import Image
 
 import mi_ring
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
+from mi_ring.colour_profiles import srgb_to_linear
+from mi_ring.images import linear_to_srgb
+from mi_ring.scene.shot import STRAIGHT, ToneCurve
 
 MATERIALS = ["principled base_color=0.6,0.3,0.1 roughness=0.4", "principled base_color=0.2,0.4,0.5 roughness=0.7"]
 ROOM, LIGHT, POWER = 0.1, 3.0, 10.0  #: options of mi-ring synthesize
@@ -35,8 +39,8 @@ SHOWN = 0.3  #: least correlation that is printed
 WITHIN = 1.645  #: standard deviations that hold nine of ten normally distributed errors
 
 
-def synthesized(mesh: str, material: str, number: int, out: Path) -> Path:
-    """A capture of a mesh. Returns its folder."""
+def synthesized(mesh: str, material: str, number: int, out: Path, curve: ToneCurve) -> Path:
+    """A capture of a mesh, recorded with a tone curve. Returns its folder."""
     if not (out / "truth/exact.xml").exists():
         options = ["--views", 24, "--novel", 0, "--size", 160, 160, "--cameras", "free", "--wrong-light", LIGHT,
                    "--wrong-power", POWER, "--format", "png8", "--spp", 25, "--seed", number]  # fmt: skip
@@ -44,10 +48,13 @@ def synthesized(mesh: str, material: str, number: int, out: Path) -> Path:
             options += ["--room", ROOM, "--room-kind", "harmonics", "--wrong-room"]
         command = ["-m", "mi_ring.synthesize", mesh, out, "--material", material, *options]
         subprocess.run([sys.executable, *map(str, command)], check=True, stdout=subprocess.DEVNULL)
+        for file in (out / "images").iterdir() if curve != STRAIGHT else ():
+            encoded = linear_to_srgb(curve.applied(srgb_to_linear(np.asarray(Image.open(file), float) / 255)))
+            Image.fromarray((255 * encoded + 0.5).astype(np.uint8)).save(file)
     return out
 
 
-def errors(folder: Path, out: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def errors(folder: Path, out: Path, curve: ToneCurve) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Of each unknown of a fit: (errors, standard deviations), in units that do not depend on the object's size."""
     found = json.loads((out / "calibration.json").read_text())
     given, true = (mi_ring.load_capture(folder / name) for name in ("scene.xml", "truth/exact.xml"))
@@ -68,7 +75,7 @@ def errors(folder: Path, out: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     share = calibration.room_share(calibration.room_harmonics()).numpy()
     result["room, % of the flash"] = [100 * (np.array(unknowns["ambient"]["after"]) - share),
                                       100 * np.array(unknowns["ambient"]["std"])]  # fmt: skip
-    for name, truth in (("falloff", 0), ("contrast", 1)):
+    for name, truth in {"falloff": 0, "contrast": curve.contrast, "curve": curve.gamma, "toe": curve.toe}.items():
         if name in unknowns:
             result[name] = [np.array([unknowns[name]["after"] - truth]), np.array([unknowns[name]["std"]])]
     return {name: (np.ravel(error), np.ravel(std)) for name, (error, std) in result.items()}
@@ -81,16 +88,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/coverage"))
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--materials", nargs="+", default=MATERIALS)
+    parser.add_argument("--curve", type=float, nargs=3, default=STRAIGHT)
     options, of_fit = parser.parse_known_args()
+    curve = ToneCurve(*options.curve)
     correlations: dict[str, list[float]] = {}
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for k in range(options.count):
         mesh, material = (names[k % len(names)] for names in (options.meshes, options.materials))
-        folder = synthesized(mesh, material, k, options.out / str(k))
+        folder = synthesized(mesh, material, k, options.out / str(k), curve)
         out = folder / "-".join(["fit", *of_fit]).replace("/", "_")
         for pair in fitted(folder / "scene.xml", out, ["--preset", "fast", *of_fit])["correlations"]:
             correlations.setdefault(" and ".join(sorted(pair["options"])), []).append(pair["value"])
-        for name, both in errors(folder, out).items():
+        for name, both in errors(folder, out, curve).items():
             found.setdefault(name, []).append(both)
             print(k, name, *both, file=sys.stderr, flush=True)
     rows = []

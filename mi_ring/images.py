@@ -48,16 +48,18 @@ def linear_to_srgb(v: np.ndarray) -> np.ndarray:
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def contrasted(linear: Pictures, contrast: Any) -> Pictures:
+def contrasted(linear: Pictures, contrast: Any, toe: Any = 0.0) -> Pictures:
     """Apply an S-curve, like the curve of film, to linear values of any shape. Values of at least 1 do not change.
 
-    In terms of the sRGB value v, the curve is vᶜ / (vᶜ + (1 − v)ᶜ), where c is `contrast`, a number above 0. Contrast 1
-    changes nothing, and contrast 1 / c undoes the curve. Returns linear values.
+    In terms of the sRGB value v, the curve is vᶜ / (vᶜ + (eᵗ (1 − v))ᶜ), where c is `contrast`, a number above 0, and t
+    is `toe`. With a positive toe the dark end of the curve is longer. Contrast 1 and toe 0 change nothing. Contrast
+    1 / c and toe −c t undo the curve. Returns linear values.
     """
     where: Any = torch.where if isinstance(linear, Tensor) else np.where
     x = linear.clip(1e-6, 1 - 1e-6)  # so that the powers have finite derivatives
     v = where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    a, b = v**contrast, (1 - v) ** contrast
+    darker = toe.exp() if isinstance(toe, Tensor) else math.exp(toe)
+    a, b = v**contrast, (darker * (1 - v)) ** contrast
     v = a / (a + b)
     y = where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
     return where(linear < 1, y * where(linear < x, linear / x, 1.0), linear)  # linear below 1e-6

@@ -160,7 +160,7 @@ def test_what_no_fit_could_use_is_refused_with_the_argument(changes, message):
 
 def test_captures_and_photographs_never_change():
     capture = made()
-    for value, name in ((capture, "shots"), (capture, "masks"), (capture.shots[0], "camera"), (Response(), "gamma")):
+    for value, name in ((capture, "shots"), (capture, "masks"), (capture.shots[0], "camera"), (Response(), "gain")):
         with pytest.raises(FrozenInstanceError):
             setattr(value, name, None)
     bright = replace(capture, shots=(replace(capture.shots[0], response=Response(gain=(2.0, 2.0, 2.0))),))

@@ -34,6 +34,7 @@ from mi_ring.output.calibration_panel import held_out_text
 from mi_ring.rendering import prediction
 from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.rendering.views import Views
+from mi_ring.scene.shot import ToneCurve
 
 CENTER = np.array([400.0, -150.0, 90.0])  #: of the object of `small_capture`
 FLASH = np.array([15.0, 10.0, 0.0])  #: of its flash, in the cameras' axes
@@ -192,7 +193,7 @@ def test_lens_gain_and_curve_are_undone_in_a_file_that_they_made(small_capture):
     gain = np.exp([0, 0.1 * (calibration.gain[4, 1].item() - 0.5), 0])
     shot = calibration.applied(capture).shots[4]
     gamma, n, (width, height) = np.exp(0.8 * 0.2), 2.0, shot.size
-    assert (shot.response.gamma, shot.response.vignetting) == (pytest.approx(gamma), pytest.approx(n))
+    assert (shot.response.curve.gamma, shot.response.vignetting) == (pytest.approx(gamma), pytest.approx(n))
     radiance = np.random.default_rng(3).uniform(0.05, 0.9, (height, width, 3)).astype(np.float32)
     (fx, fy), (cx, cy) = shot.camera.focal, shot.camera.centre
     cosine = np.array([[1 / np.sqrt(1 + ((u + 0.5 - cx) / fx) ** 2 + ((v + 0.5 - cy) / fy) ** 2)
@@ -525,16 +526,16 @@ def test_curve_leaves_the_exposure_alone_and_a_file_decoded_with_it_is_radiance(
     recorded.sum().backward()
     assert radiance.grad.isfinite().all()
     shot = calibration.applied(capture).shots[4]
-    assert shot.response.gamma == pytest.approx(gamma, rel=1e-5)
+    assert shot.response.curve.gamma == pytest.approx(gamma, rel=1e-5)
     # What the photograph then says of a lit surface, by the strength of its light then.
     factor = shot.light.rgb[0] / capture.shots[4].light.rgb[0]
-    decoded, _ = decode(expected.astype(np.float32), True, 2.0, shot.response.gamma)
+    decoded, _ = decode(expected.astype(np.float32), True, 2.0, ToneCurve(shot.response.curve.gamma))
     np.testing.assert_allclose(decoded, factor * np.array([0.01, 0.3, 0.7]), rtol=1e-4)
 
 
 def test_a_curve_with_an_s_is_that_of_the_scene_that_it_makes(small_capture, tmp_path):
     def curve(element):
-        for name, value in (("gamma", "1.3"), ("contrast", "1.2")):
+        for name, value in (("gamma", "1.3"), ("contrast", "1.2"), ("toe", "-0.4")):
             ElementTree.SubElement(element, "float", name=name, value=value)
 
     capture = mi_ring.load_capture(edited(small_capture, tmp_path / "curve", curve))
@@ -543,16 +544,19 @@ def test_a_curve_with_an_s_is_that_of_the_scene_that_it_makes(small_capture, tmp
     with torch.no_grad():
         calibration.curve.fill_(0.8)
         calibration.contrast.fill_(-1.5)
+        calibration.toe.fill_(0.7)
     shot, radiance = calibration.applied(capture).shots[4], np.array([0.02, 0.11, 0.3, 0.71])
     gamma, contrast = np.exp(0.8 * 0.2), np.exp(-1.5 * 0.2)
-    assert shot.response.gamma == pytest.approx(1.3 * gamma, rel=1e-6)
-    assert shot.response.contrast == pytest.approx(1.2 * contrast, rel=1e-6)
+    assert shot.response.curve.gamma == pytest.approx(1.3 * gamma, rel=1e-6)
+    assert shot.response.curve.contrast == pytest.approx(1.2 * contrast, rel=1e-6)
+    toe = 0.7 * 0.3
+    assert shot.response.curve.toe == pytest.approx(toe - 0.4 / contrast, rel=1e-6)
     stronger = exposure ** ((1 - gamma) / gamma)  # the lights of that scene
     file = recorded(stronger * radiance, shot)
     v = linear_to_srgb((stronger * radiance) ** (1.3 * gamma))
-    odds = (v / (1 - v)) ** (1.2 * contrast)
+    odds = (np.exp(0.4) * (np.exp(-toe) * v / (1 - v)) ** contrast) ** 1.2  # first the one that the fit finds
     np.testing.assert_allclose(linear_to_srgb(file), odds / (1 + odds), rtol=1e-4)
-    as_given, _ = decode(file.astype(np.float32), True, 2.0, 1.3, 1.2)
+    as_given, _ = decode(file.astype(np.float32), True, 2.0, ToneCurve(1.3, 1.2, -0.4))
     curved = calibration.response().with_curve(tensor(radiance)[None], torch.tensor([1.3]))
     np.testing.assert_allclose(curved[0].detach(), as_given, rtol=1e-4)
     straight = calibration.response().without_curve(curved.detach(), torch.tensor([1.3]))
@@ -562,9 +566,9 @@ def test_a_curve_with_an_s_is_that_of_the_scene_that_it_makes(small_capture, tmp
     assert many.grad.isfinite().all() and (many.grad > 0).all()
 
 
-@pytest.mark.parametrize("name", ["curve", "vignetting"])
+@pytest.mark.parametrize("name", ["curve", "toe", "vignetting"])
 def test_gradients_of_what_is_recorded_equal_finite_differences(small_capture, name):
-    calibration = unknowns_of(mi_ring.load_capture(small_capture), (name,))
+    calibration = unknowns_of(mi_ring.load_capture(small_capture), (UNKNOWNS[name].option,))
     random = np.random.default_rng(4)
     radiance, weights = (tensor(random.uniform(0.02, 0.9, (2, 40, 56, 3))) for _ in range(2))
     unknown = getattr(calibration, name)
@@ -599,7 +603,7 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
         np.testing.assert_allclose(np.array(a), np.array(b), rtol=1e-5, atol=1e-5)
     for a, b in zip(read.shots, applied.shots):
         np.testing.assert_allclose(a.response.gain, b.response.gain, rtol=1e-6)
-    assert [s.response.gamma for s in read.shots] == pytest.approx([s.response.gamma for s in applied.shots])
+        np.testing.assert_allclose(a.response.curve, b.response.curve, rtol=1e-6)
     assert [s.files for s in read.shots] == [s.files for s in capture.shots]
 
 

@@ -230,7 +230,7 @@ def values(tmp_path):
         "photograph": [{
             "filename": "a.png", "mask": "b.png", "valid": "c.png", "ambient": "d.png",
             "fx": 11.0, "fy": 12.0, "cx": 2.0, "cy": 3.0, "to_world": moved,
-            "encoding": "linear", "saturation": 0.9, "gamma": 1.1, "contrast": 1.2,
+            "encoding": "linear", "saturation": 0.9, "gamma": 1.1, "contrast": 1.2, "toe": 0.1,
             "vignetting": 2.0, "gain": "1 2 0.5", "distortion": -0.01, "falloff": 3.0, "tilt": "0.5 -1",
             "calibrated": True, "film": film, "emitter": light,
         }],

@@ -31,7 +31,7 @@ from mi_ring.output.exporting import resolution_of
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import Light
-from mi_ring.scene.shot import Files, Response, Shot
+from mi_ring.scene.shot import Files, Response, Shot, ToneCurve
 
 PALE = np.array([0.5, 0.4, 0.3])  #: colour without print, linear
 MATTE = PALE / np.pi  #: the diffuse parameter of `cooktorrance` for it
@@ -324,8 +324,8 @@ def test_photographs_are_decoded_with_the_curve_that_the_fit_has_found(print_sce
     capture = load_capture(print_scene, width=40)
     given = capture.shots[0]
     plain, curved = (
-        fine_texture.enlarged(capture, 0, *fine_texture.at_width(given, replace(given, response=Response(gamma)), 160))
-        for gamma in (1, 2)
+        fine_texture.enlarged(capture, 0, *fine_texture.at_width(given, replace(given, response=Response(curve)), 160))
+        for curve in (ToneCurve(), ToneCurve(gamma=2))
     )
     assert plain.rgb.shape == (1, 148, 160, 3)  # what the fit sees at 40 px: whole blocks of 4 × 4 px
     np.testing.assert_allclose(curved.rgb, plain.rgb**0.5, atol=2e-3)

@@ -47,10 +47,10 @@ def test_photographs_share_the_unknowns_of_their_lens_and_flash(small_capture):
     layout = Layout(Fit(mi_ring.load_capture(small_capture), config).model.calibration)
     first, other = (layout.of(np.array([k])) for k in (2, 7))
     shared = {name for (name, _, a), (_, _, b) in zip(first, other) if a == b}
-    assert shared == {"focal", "light", "curve"}
+    assert shared == {"focal", "light", "curve", "toe"}
     own = [int(place[0]) for entry in (first, other) for name, _, place in entry if name not in shared]
     assert len(own) == len(set(own)) == 2 * 9
-    assert layout.count == 12 * 9 + 1 + 3 + 1
+    assert layout.count == 12 * 9 + 1 + 3 + 2
 
 
 def test_photographs_tell_unknowns_and_keep_them_as_they_are(small_capture):
@@ -86,7 +86,7 @@ def test_photographs_tell_unknowns_and_keep_them_as_they_are(small_capture):
     assert photograph["turned_degrees"] == pytest.approx(np.degrees(float(turn)), rel=1e-5)
     np.testing.assert_allclose(photograph["std"]["power"], found["power"][3] * photograph["power"], rtol=1e-5)
     page = panel(running.capture, running.calibrated(), summary)
-    assert [row[0].split()[0] for row in page.rows] == ["place", "exponent", "cameras", "and", "power"]
+    assert [row[0].split()[0] for row in page.rows] == ["place", "exponent", "toe", "cameras", "and", "power"]
     assert page.chart.startswith("data:image/svg")
 
     assert found["light"].max() < 0.3 * calibration.widths["light"]

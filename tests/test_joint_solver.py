@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize_scalar
 
 import mi_ring
 from mi_ring.fitting import joint_equations, optimisation
 from mi_ring.fitting.comparison import ROOM
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.joint_equations import JointEquations
-from mi_ring.fitting.joint_solver import DOUBT, doubt, solve_jointly
+from mi_ring.fitting.joint_solver import DOUBT, doubt, solve_jointly, with_learnt_width
 from mi_ring.fitting.normal_equations import Layout
 from mi_ring.fitting.summary import summary
 from mi_ring.rendering.spherical_harmonics import BASIS, PER_FRAME
@@ -79,14 +80,36 @@ def test_all_else_is_found_beside_the_room_that_is_believed(small_capture, monke
     assert not found["ambient"].any()
     power, room = layout.places("power"), layout.places("ambient")
     expected = truth.copy()
-    own = matrix[np.ix_(power, power)] + np.eye(len(power))
-    expected[power] = np.linalg.solve(own, (matrix @ truth)[power])  # the room is 0
-    np.testing.assert_allclose(found["power"].ravel(), (layout.centring() @ expected)[power], atol=1e-5)
-    assert np.abs(found["power"].numpy().ravel() - (layout.centring() @ truth)[power]).max() > 1e-4
+    expected[power] = np.linalg.solve(matrix[np.ix_(power, power)], (matrix @ truth)[power])  # the room is 0
+    expected = (layout.centring() @ expected)[power]
+    assert np.abs(expected - (layout.centring() @ truth)[power]).max() > 1e-4
+    expected *= 1 - (0.4 / expected.std()) ** 2  # from 0 nearer to it, the more the powers differ
+    np.testing.assert_allclose(found["power"].ravel(), expected, atol=1e-5)
     assert len(room) + len(power) == layout.count
-    truth[power] *= 0.1  # powers that hardly differ are left to the quarters of photographs
+    truth[power] *= 0.2  # powers that hardly differ are left to the quarters of photographs
     monkeypatch.setattr(JointEquations, "of", lambda *_: JointEquations(layout, matrix, matrix @ truth))
     assert [*solve_jointly(fit.problem, fit.model, fit.renderer, 2)] == ["ambient"]
+
+
+@pytest.mark.parametrize("spread", [0.3, 2.5])
+def test_the_width_of_the_powers_prior_is_that_of_the_largest_evidence(small_capture, spread):
+    """By a search over the logarithm of the marginal likelihood, in units of the prior that is written down."""
+    layout = Layout(fit_of(small_capture, refine=("power",)).model.calibration)
+    random, count = np.random.default_rng(6), layout.count
+    slopes = random.normal(size=(3 * count, count))
+    truth = layout.centring() @ (spread * random.normal(size=count))
+    matrix, right = slopes.T @ slopes, slopes.T @ (slopes @ truth + 2 * random.normal(size=len(slopes)))
+    matrix, right = matrix / 4, right / 4
+    found, width = with_learnt_width(layout, ["power"], np.arange(count), matrix, right)
+
+    def evidence(width):
+        system = matrix + np.eye(count) / width**2
+        return right @ np.linalg.solve(system, right) / 2 - np.linalg.slogdet(np.eye(count) + width**2 * matrix)[1] / 2
+
+    best = minimize_scalar(lambda log: -evidence(np.exp(log)), (-3.0, 3.0)).x
+    assert width / 0.1 == pytest.approx(np.exp(best), rel=0.05)
+    solved = layout.centring() @ np.linalg.solve(matrix + np.eye(count) / np.exp(2 * best), right)
+    np.testing.assert_allclose(found, solved, atol=0.03 * spread)
 
 
 def test_what_the_scene_file_tells_of_a_room_may_be_more_or_less(small_capture, monkeypatch):

@@ -22,7 +22,7 @@ from mi_ring.capture.decoding import LinearImage, recorded
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.pixels import Pixels
 from mi_ring.geometry.camera import Camera
-from mi_ring.scene.shot import Response, Shot, Window
+from mi_ring.scene.shot import Response, Shot, ToneCurve, Window
 from mi_ring.synthesis.viewpoints import look_at
 from mi_ring.system import cache
 from mi_ring.system.cached_arrays import key_of
@@ -89,9 +89,9 @@ def test_a_photograph_is_gone_from_memory_when_it_is_resized(kind, monkeypatch):
 @pytest.mark.parametrize("again", [False, True])  # True: the reduced photograph is read from the cache folder
 def test_another_tone_curve_decodes_a_reduced_photograph_otherwise(tmp_path, again):
     """Closed form: linear = (S-curve⁻¹(sRGB⁻¹(value)))^(1/γ). The photograph is of one grey, so averages keep it."""
-    value, (gamma, contrast), (refined_gamma, refined_contrast) = 90, (1.1, 1.2), (1.3, 0.8)
+    value, given, curve = 90, ToneCurve(1.1, 1.2, 0.3), ToneCurve(1.3, 0.8, -0.1)
     grey = np.full((HEIGHT, WIDTH, 3), value, np.uint8)
-    response = Response(gamma, contrast)
+    response = Response(given)
     made = Capture.from_arrays([grey] * 3, photographs()[1], cameras=[camera(k) for k in range(3)])
     path = (
         replace(made, shots=tuple(replace(shot, response=response) for shot in made.shots))
@@ -102,15 +102,15 @@ def test_another_tone_curve_decodes_a_reduced_photograph_otherwise(tmp_path, aga
     if again:
         capture = load_capture(path, width=200)
 
-    def linear(gamma, contrast):
-        odds = (value / (255 - value)) ** (1 / contrast)
+    def linear(gamma, contrast, toe):
+        odds = np.exp(toe) * (value / (255 - value)) ** (1 / contrast)
         return srgb_to_linear(odds / (1 + odds)) ** (1 / gamma)
 
-    assert capture.observe([0]).rgb.numpy() == pytest.approx(linear(gamma, contrast), rel=2e-3)
-    other = tuple(replace(shot, response=Response(refined_gamma, refined_contrast)) for shot in capture.shots)
+    assert capture.observe([0]).rgb.numpy() == pytest.approx(linear(*given), rel=2e-3)
+    other = tuple(replace(shot, response=Response(curve)) for shot in capture.shots)
     refined = replace(capture, shots=other)
     seen = refined.observe([0]).rgb.numpy()
-    assert seen == pytest.approx(linear(refined_gamma, refined_contrast), rel=2e-3)
+    assert seen == pytest.approx(linear(*curve), rel=2e-3)
     assert recorded(seen[0], other[0]) == pytest.approx(float(srgb_to_linear(value / 255)), rel=2e-3)
 
 

@@ -32,6 +32,7 @@ from mi_ring.rendering.views import Views
 from mi_ring.scene.assembly import with_lamps
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.scene.lobes import Lobes
+from mi_ring.scene.shot import ToneCurve
 from mi_ring.system.machine import device
 
 #: All options of `--refine` with values in a calibration, in order.
@@ -260,6 +261,7 @@ class Calibration(nn.Module):
         estimate = self.estimate()
         views, lamps = self.rig.views_of(estimate), self.rig.lamps_of(estimate)
         gamma, contrast = (float(self.value(name).exp()) for name in ("curve", "contrast"))
+        curve = ToneCurve(gamma, contrast, float(self.value("toe")))
         gains = np.ones((len(self.rig), 3))
         if "gain" in self.refined:
             unknown = self.unknowns["gain"]
@@ -271,7 +273,7 @@ class Calibration(nn.Module):
         views = Views(*(part.double().numpy() for part in views))
         shots = []
         for k, shot in enumerate(capture.shots):
-            response = shot.response.changed(gamma, contrast, float(self.value("vignetting")), gains[k])
+            response = shot.response.changed(curve, float(self.value("vignetting")), gains[k])
             shot = replace(shot, camera=views.camera(k, shot.size), response=response)
             if not self.rig.mixed or self.rig.lit[k]:
                 falloff, left, up = views.cone[k].tolist()

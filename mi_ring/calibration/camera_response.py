@@ -22,6 +22,7 @@ class CameraResponse(NamedTuple):
 
     exponent: Tensor | None  #: logarithm of the curve's exponent: the decoded value is radiance to this power
     contrast: Tensor | None  #: logarithm of the steepness of the curve's S
+    toe: Tensor | None  #: how much longer the dark end of this S is than the bright end
     vignetting: Tensor | None  #: exponent of the cosine about the optical axis, added to the known one
     gammas: Tensor  #: (P,) exponents that the capture knows
     known_vignetting: Tensor  #: (P,) exponents of vignetting that the capture knows
@@ -53,6 +54,16 @@ class CameraResponse(NamedTuple):
         known, unknown = self.factors(recorded, index, cosines)
         return self.without_curve(recorded * known, self.gammas[index]) / known / unknown
 
+    @property
+    def bent(self) -> bool:
+        """True if the fit refines the S of the curve."""
+        return self.contrast is not None or self.toe is not None
+
+    def s_curve(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return contrast and toe of the refined S-curve, with the dtype and the device of `like`."""
+        contrast, toe = (torch.zeros(()) if part is None else part for part in (self.contrast, self.toe))
+        return contrast.exp().to(like), toe.to(like)
+
     def factors(
         self, like: Tensor, index: Sequence[int] | np.ndarray, cosines: Tensor | None
     ) -> tuple[Tensor | float, Tensor | float]:
@@ -83,7 +94,7 @@ class CameraResponse(NamedTuple):
         if self.exponent is not None:
             relative = radiance / self.exposure
             radiance = radiance * relative.clamp(min=DARKEST) ** (self.exponent.exp().to(radiance) - 1)
-        return radiance if self.contrast is None else with_contrast(radiance, self.contrast.exp(), gammas)
+        return with_contrast(radiance, *self.s_curve(radiance), gammas) if self.bent else radiance
 
     @torch.no_grad()
     def without_curve(self, recorded: Tensor, gammas: Tensor) -> Tensor:
@@ -91,23 +102,24 @@ class CameraResponse(NamedTuple):
 
         `gammas` (N,): exponents of the capture's own tone curve, one for each photograph.
         """
-        if self.contrast is not None:
-            recorded = with_contrast(recorded, (-self.contrast).exp(), gammas)
+        if self.bent:
+            contrast, toe = self.s_curve(recorded)
+            recorded = with_contrast(recorded, 1 / contrast, -contrast * toe, gammas)
         if self.exponent is None:
             return recorded
         relative, gamma = recorded / self.exposure, float(self.exponent.exp())
         return recorded * relative.clamp(min=DARKEST**gamma) ** (1 / gamma - 1)
 
 
-def with_contrast(values: Tensor, contrast: Tensor, gammas: Tensor) -> Tensor:
-    """Apply an S-curve of steepness `contrast` to decoded values (N, ...). Steepness 1 changes nothing.
+def with_contrast(values: Tensor, contrast: Tensor, toe: Tensor, gammas: Tensor) -> Tensor:
+    """Apply an S-curve of steepness `contrast` and with a `toe` to decoded values (N, ...). 1 and 0 change nothing.
 
-    `gammas` (N,): exponents with which the values were decoded. Two S-curves one after the other are one S-curve, whose
-    steepness is the product. So the capture's own contrast is not needed here.
+    `gammas` (N,): exponents with which the values were decoded. Two S-curves one after the other are one S-curve, as in
+    `ToneCurve.after`. So the capture's own is not needed here.
     """
     gammas = gammas.to(values).view(-1, *[1] * (values.ndim - 1))
     lit = values.clamp(min=BLACK)  # below it the curve is a straight line
-    return contrasted(lit**gammas, contrast.to(values)) ** (1 / gammas) * (values / lit)
+    return contrasted(lit**gammas, contrast.to(values), toe.to(values)) ** (1 / gammas) * (values / lit)
 
 
 @torch.no_grad()
@@ -123,5 +135,5 @@ def contrast_slope(
     known, _ = response.factors(recorded, index, cosines if response.has_vignetting else None)
     values, one = (recorded * known).clamp(BLACK, 1 - BLACK), torch.ones(()).to(recorded)
     with forward_ad.dual_level():
-        changed = with_contrast(values, forward_ad.make_dual(one, one), response.gammas[index])
+        changed = with_contrast(values, forward_ad.make_dual(one, one), 0 * one, response.gammas[index])
         return forward_ad.unpack_dual(changed.log()).tangent

@@ -103,7 +103,7 @@ class Rig:
         self.lens = torch.from_numpy(lens)  #: (P,) number of each photograph's lens
         self.place = torch.from_numpy(place if self.flash is None else np.zeros_like(place))  #: (P,) of its light
         self.response = CameraResponse(
-            None, None, None, torch.tensor([shot.response.gamma for shot in capture.shots]),
+            None, None, None, None, torch.tensor([shot.response.curve.gamma for shot in capture.shots]),
             torch.tensor([shot.response.vignetting for shot in capture.shots]), exposure,
             torch.from_numpy(np.stack([shot.response.gain for shot in capture.shots])).float(),
         )  # fmt: skip

@@ -200,8 +200,20 @@ class CurveExponent(Unknown):
         return replace(now, response=now.response._replace(exponent=value))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        before, after = found.means(lambda shot: shot.response.gamma)
+        before, after = found.means(lambda shot: shot.response.curve.gamma)
         return "exponent of the camera's curve", before, after, after * std
+
+
+class Toe(Unknown):
+    """How much longer the dark end of the tone curve's S is than the bright end. One number for all photographs."""
+
+    changes = "recording"
+
+    def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
+        return replace(now, response=now.response._replace(toe=value))
+
+    def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
+        return "toe of the camera's curve", *found.means(lambda shot: shot.response.curve.toe), std
 
 
 class Contrast(Unknown):
@@ -217,7 +229,7 @@ class Contrast(Unknown):
         return replace(now, response=now.response._replace(contrast=value.detach()))
 
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
-        before, after = found.means(lambda shot: shot.response.contrast)
+        before, after = found.means(lambda shot: shot.response.curve.contrast)
         return "contrast of the camera's curve", before, after, after * std
 
 
@@ -287,6 +299,7 @@ UNKNOWNS: dict[str, Unknown] = {unknown.name: unknown for unknown in (
     Tilt("tilt", "falloff", 1.0, "capture", 2, own_lights=True),
     Vignetting("vignetting", "vignetting", 1.0, "capture"),
     CurveExponent("curve", "curve", 0.2, "capture"),
+    Toe("toe", "curve", 0.3, "capture"),
     Contrast("contrast", "contrast", 0.2, "capture"),
     Gain("gain", "gain", 0.1, "photograph", 3),
     Scale("scale", "scale", 0.7, "capture", own_lights=True),

@@ -11,8 +11,8 @@ from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading
 from mi_ring.image_headers import encoding_of, image_size
-from mi_ring.images import contrasted, linear_to_srgb, mask_values, read_image
-from mi_ring.scene.shot import Encoding, Shot
+from mi_ring.images import linear_to_srgb, mask_values, read_image
+from mi_ring.scene.shot import STRAIGHT, Encoding, Shot, ToneCurve
 
 COMMON = 224, 248  #: the 8-bit values from the first to before the second are those of pixels that are not clipped
 FREQUENT = 1.5  #: values are clipped that are so many times as frequent
@@ -23,45 +23,39 @@ class LinearImage(NamedTuple):
 
     rgb: np.ndarray  #: (H, W, 3) linear radiance, float16 or float32
     clipped: np.ndarray  #: (H, W, 3) bool
-    gamma: float = 1.0  #: exponent of the camera's tone curve that was removed
-    contrast: float = 1.0  #: S-curve of it
+    curve: ToneCurve = STRAIGHT  #: of the camera, which was removed
 
     @property
     def nbytes(self) -> int:
         """Number of bytes that `rgb` and `clipped` need together."""
         return self.rgb.nbytes + self.clipped.nbytes
 
-    def radiance(self, gamma: float, contrast: float) -> np.ndarray:
+    def radiance(self, curve: ToneCurve) -> np.ndarray:
         """Return the radiance (H, W, 3) float32 as if this tone curve had been removed instead.
 
         This is approximate at edges, because pixels were averaged under the other curve.
         """
         linear = self.rgb.astype(np.float32)
-        if (gamma, contrast) == (self.gamma, self.contrast):
-            return linear
-        recorded = contrasted(np.maximum(linear, 0) ** np.float32(self.gamma), self.contrast / contrast)
-        return recorded.astype(np.float32) ** np.float32(1 / gamma)
+        return linear if curve == self.curve else curve.removed(self.curve.applied(linear)).astype(np.float32)
 
 
 def decode(
-    image: np.ndarray | LinearImage, linear: bool, saturation: float, gamma: float = 1.0, contrast: float = 1.0
+    image: np.ndarray | LinearImage, linear: bool, saturation: float, curve: ToneCurve = STRAIGHT
 ) -> tuple[np.ndarray, np.ndarray]:
     """Decode pixels. Returns (linear radiance, float32; clipped pixels, bool), both in the shape of `image`.
 
     `linear`: True if the encoded pixels are linear, False if they are sRGB. `saturation`: encoded value (1 = full
-    scale) from which a pixel is clipped. `gamma`, `contrast`: exponent and S-curve of the camera's tone curve, which is
-    removed; 1: none. A `LinearImage` is decoded already; it is converted if another curve was removed.
+    scale) from which a pixel is clipped. `curve`: of the camera, which is removed. A `LinearImage` is decoded already;
+    it is converted if another curve was removed.
     """
     if isinstance(image, LinearImage):
-        return image.radiance(gamma, contrast), image.clipped
+        return image.radiance(curve), image.clipped
     if image.dtype == np.float32:
         value = image
     else:
         full = np.iinfo(image.dtype).max
         value = np.arange(full + 1, dtype=np.float32) / full
-    lookup = value if linear else srgb_to_linear(value)
-    lookup = lookup if contrast == 1 else contrasted(lookup, 1 / contrast).astype(np.float32)
-    lookup = lookup if gamma == 1 else np.maximum(lookup, 0) ** np.float32(1 / gamma)
+    lookup = curve.removed(value if linear else srgb_to_linear(value))
     if image.dtype == np.float32:
         return lookup, value >= saturation
     return lookup[image], image >= np.searchsorted(value, np.float32(saturation))
@@ -101,8 +95,7 @@ def recorded(radiance: np.ndarray, shot: Shot, scale: int = 1) -> np.ndarray:
 
     H, W: size of the photograph / `scale`.
     """
-    curved = (radiance * shade(shot, scale)) ** shot.response.gamma
-    return curved if shot.response.contrast == 1 else contrasted(curved, shot.response.contrast)
+    return shot.response.curve.applied(radiance * shade(shot, scale))
 
 
 def read_pixels(path: Path, field: str, shot: Shot, scene: Path) -> np.ndarray:
@@ -141,9 +134,9 @@ def read_photograph(shot: Shot, scene: Path) -> np.ndarray:
     image = read_colours(shot, "filename", scene)
     if not shot.files.ambient:
         return image
-    if (shot.response.gamma, shot.response.contrast) != (1, 1):
+    if shot.response.curve != STRAIGHT:
         raise InputError(f'{scene}: photograph "{shot.name}", ambient: cannot be subtracted if the camera has a curve; '
-                         "leave out gamma and contrast, or subtract it yourself")  # fmt: skip
+                         "leave out gamma, contrast and toe, or subtract it yourself")  # fmt: skip
     pictures = [image, read_colours(shot, "ambient", scene)]
     (lit, clipped), (ambient, too) = (
         decode(p, is_linear(shot.encoding, p), clip_value(p, shot.saturation)) for p in pictures
@@ -191,7 +184,7 @@ def has_open_curve(shots: Sequence[Shot]) -> bool:
 
     Raises InputError if a file cannot be read.
     """
-    if any(shot.response.gamma != 1 or shot.response.contrast != 1 or shot.files.ambient for shot in shots):
+    if any(shot.response.curve != STRAIGHT or shot.files.ambient for shot in shots):
         return False
     encodings = set()
     for file, encoding in {(shot.files.filename, shot.encoding) for shot in shots}:

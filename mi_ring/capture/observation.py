@@ -59,8 +59,8 @@ def observed(
     `image` (H, W, 3): encoded pixels. `mask`: (H, W) uint8, 255 on the object; None: no mask. `valid`: (H, W) uint8, 0
     where a pixel is ignored; None: all pixels are valid.
     """
-    curve = shot.response.gamma, shot.response.contrast
-    linear, clipped = decode(image, is_linear(shot.encoding, image), clip_value(image, shot.saturation), *curve)
+    saturation = clip_value(image, shot.saturation)
+    linear, clipped = decode(image, is_linear(shot.encoding, image), saturation, shot.response.curve)
     linear = linear / shade(shot)
     coverage = np.zeros(linear.shape[:2], np.uint8) if mask is None else mask
     shown = None

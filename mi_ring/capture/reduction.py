@@ -17,7 +17,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import LinearImage, clip_value, decode, is_linear, read_mask, read_photograph
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.images import ROWS, box_filter
-from mi_ring.scene.shot import Shot, Window
+from mi_ring.scene.shot import Shot, ToneCurve, Window
 from mi_ring.system import cache
 from mi_ring.system.cached_arrays import archived, key_of, read_archive, remembered
 from mi_ring.system.files import digest
@@ -163,8 +163,7 @@ def through(capture: Capture, windows: Sequence[Window], doing: str) -> Capture:
         files = [source(sources[name]) for name in make]
         if not all(files):  # arrays of the user
             return make
-        key = key_of("photograph", *make, files, shot.encoding, shot.saturation, shot.response.gamma,
-                     shot.response.contrast, window)  # fmt: skip
+        key = key_of("photograph", *make, files, shot.encoding, shot.saturation, *shot.response.curve, window)
         stored: dict[str, Callable[[], Any]]
         stored = {name: partial(unpacked, key, name, made) for name, made in make.items()}
         if cache.cached(key):
@@ -219,14 +218,13 @@ def reduced_image(shot: Shot, read: Reader, window: Window) -> LinearImage:
     rows = max(1, ROWS // blocks)
     for first in range(0, len(radiance), rows):
         part = image[top + blocks * first : top + min(blocks * (first + rows), height), left : left + width]
-        linear, over = decode(part, is_linear(shot.encoding, part), clipped_from, shot.response.gamma,
-                              shot.response.contrast)  # fmt: skip
+        linear, over = decode(part, is_linear(shot.encoding, part), clipped_from, shot.response.curve)
         radiance[first : first + rows] = averaged(linear, blocks)
         if over.any():
             clipped[first : first + rows] = averaged(over, blocks) > 0
     image = part = linear = np.empty(0)  # views keep the photograph in memory; it is larger than what was made of it
     over = resized(clipped.astype(np.float32), window) > 0
-    return LinearImage(resized(radiance, window).astype(kept), over, shot.response.gamma, shot.response.contrast)
+    return LinearImage(resized(radiance, window).astype(kept), over, shot.response.curve)
 
 
 def reduced_mask(read: Reader, window: Window) -> np.ndarray:
@@ -296,8 +294,8 @@ def packed(key: str, arrays: dict[str, Any]) -> memoryview:
     `arrays`: a dict with "images" (a `LinearImage`), and "masks" and "valid" if the photograph has them.
     """
     image = arrays["images"]
-    curve = np.array([image.gamma, image.contrast])
-    return archived(key, arrays | {"images": image.rgb, "clipped": np.packbits(image.clipped), "curve": curve})
+    own = {"images": image.rgb, "clipped": np.packbits(image.clipped), "curve": np.array(image.curve)}
+    return archived(key, arrays | own)
 
 
 def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | LinearImage:
@@ -312,7 +310,7 @@ def unpacked(key: str, name: str, make: Callable[[], Any]) -> np.ndarray | Linea
             if name != "images":
                 return array
             clipped = np.unpackbits(file["clipped"], count=array.size).reshape(array.shape)
-            return LinearImage(array, clipped.astype(bool), *file["curve"].tolist())
+            return LinearImage(array, clipped.astype(bool), ToneCurve(*file["curve"].tolist()))
     except OSError:  # it cannot be read now
         return make()
     except ValueError:  # it is missing or damaged

@@ -25,8 +25,9 @@ FILES = "filename", "mask", "valid", "ambient", "domain", "weights"
 
 #: Optional numbers of a photograph: where a `Shot` has them, and their defaults, which are not written.
 OPTIONAL = {
-    "gamma": ("response.gamma", 1.0), "contrast": ("response.contrast", 1.0), "falloff": ("falloff", 0.0),
-    "vignetting": ("response.vignetting", 0.0), "distortion": ("camera.distortion", 0.0),
+    "gamma": ("response.curve.gamma", 1.0), "contrast": ("response.curve.contrast", 1.0),
+    "toe": ("response.curve.toe", 0.0), "vignetting": ("response.vignetting", 0.0), "falloff": ("falloff", 0.0),
+    "distortion": ("camera.distortion", 0.0),
 }  # fmt: skip
 #: Properties of a photograph, beside its light, that a fit may refine.
 REFINED = {"fx", "fy", "cx", "cy", "to_world", "gain", "tilt", *OPTIONAL}

@@ -63,7 +63,8 @@ class Common:
     falloff: the cone of a flash that moves with the camera: how fast its light decreases to the sides, and where it
     points.
     vignetting: how much darker the lens makes the corners of the image.
-    curve, contrast: exponent of the camera's response curve, and steepness of its S shape.
+    contrast: steepness of the S shape of the camera's response curve.
+    curve: exponent of the response curve, and how much longer the dark end of its S shape is than the bright end.
     scale: one factor for the intensities of all lights. The fit finds it from interreflection.
     ambient: light of the room, from all sides.
     masks: outlines of the object. The fit finds new masks after one half and three quarters of its iterations."""

@@ -5,6 +5,8 @@ the powers, the surface explains a part of them, where few photographs see it. S
 anything of either. The joint equations tell what explains all photographs together.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,6 +15,7 @@ from mi_ring.calibration.calibration import Calibration
 from mi_ring.fitting.comparison import ROOM
 from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.model import Model
+from mi_ring.fitting.normal_equations import Layout
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
 from mi_ring.scene.lights import shared_emitters
@@ -21,9 +24,9 @@ DOUBT = 0.03  #: share of the flash that a room seems to have where the true ref
 SOLVED = "light", "power", "gain"  #: unknowns that are solved for beside the room
 WIDTH = 64  #: of the compared pictures [px]
 MOST = 40  #: photographs that are compared for the room alone: more hardly tell more, and take longer
-#: Standard deviation of powers or gains from which they and the flash are taken from the solution. Smaller ones may be
-#: errors of cameras and masks, which `ExposureSolver` tells by quarters of photographs.
-LARGE = 0.05
+#: Errors of cameras, masks and surface look like powers or gains that differ by so much (log, standard deviation).
+DOUBT_OF_EXPOSURES = 0.04
+ROUNDS = 8  #: in which the width of their prior is learnt
 FAINT = 0.01  #: least brightness of a room for the next number [exposure]
 SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share of the first
 
@@ -65,17 +68,39 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
         found[:, found[0] < 0] = 0  # a room with negative mean radiance is impossible
         result["ambient"] = torch.from_numpy(found)
         solution[here] = (found - given)[layout.room].ravel() / unit
-    if names:  # beside the room that is believed, and all else as it is
+    if names:  # beside the room that is believed, and all else as it is; moved toward as far as exposures differ
         own = np.concatenate([layout.places(name) for name in names])
         others = np.setdiff1d(np.arange(layout.count), own)
-        system, beside = joint.matrix[np.ix_(own, own)], joint.matrix[np.ix_(own, others)]
-        solution[own] = np.linalg.solve(system + np.eye(len(own)), right[own] - beside @ solution[others])
-        solution = layout.centring() @ solution
-    values = {name: solution[layout.places(name)].reshape(calibration.get_parameter(name).shape) for name in names}
-    vary = [calibration.widths[name] * values[name].std(0).max() for name in ("power", "gain") if name in names]
-    if max(vary, default=0.0) >= LARGE:
-        result |= {name: torch.from_numpy(value) for name, value in values.items()}
+        right = right - joint.matrix[:, others] @ solution[others]
+        solution, width = with_learnt_width(layout, names, own, joint.matrix, right)
+        share = max(0.0, 1 - (DOUBT_OF_EXPOSURES / width) ** 2) if width else 0.0
+        for name in names if share else ():
+            before = calibration.get_parameter(name).detach().double().cpu()
+            result[name] = before + share * (torch.from_numpy(solution[layout.places(name)]).view_as(before) - before)
     return result
+
+
+def with_learnt_width(
+    layout: Layout, names: Sequence[str], own: np.ndarray, matrix: np.ndarray, right: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Solve for the unknowns at the places `own`. The prior of powers or gains is as wide as these turn out to differ.
+
+    `matrix` (N, N) and `right` (N,): normal equations, without priors, of all unknowns. `names`: those to solve for.
+    Returns (the solution (N,), 0 at other places; the standard deviation of powers or gains, 0 if there are none). The
+    width is that of the largest evidence, by expectation-maximisation ("Empirical Bayes", Carlin and Louis 2000).
+    """
+    result, precision, width = np.zeros(layout.count), np.ones(layout.count), 0.0
+    centring = layout.centring()
+    for _ in range(ROUNDS):
+        covariance = np.linalg.inv(matrix[np.ix_(own, own)] + np.diag(precision[own]))
+        result[own] = covariance @ right[own]
+        result = centring @ result
+        for name in {"power", "gain"} & {*names}:
+            here = layout.places(name)
+            squares = result[here] ** 2 + np.diag(covariance)[np.isin(own, here)]
+            precision[here] = 1 / squares.mean()
+            width = layout.calibration.widths[name] * float(squares.mean()) ** 0.5
+    return result, width
 
 
 def believed(calibration: Calibration, more: np.ndarray, deviation: np.ndarray) -> float:

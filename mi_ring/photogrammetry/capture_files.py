@@ -19,7 +19,7 @@ from mi_ring.photogrammetry.folder import DECODED, Picture
 from mi_ring.photogrammetry.reduced_photographs import ReducedView, reduce_photograph
 from mi_ring.photogrammetry.table_plane import Plane, TexelGrid, estimate_albedo
 from mi_ring.scene.lights import Light
-from mi_ring.scene.shot import Files, Response, Shot
+from mi_ring.scene.shot import Files, Response, Shot, ToneCurve
 from mi_ring.system.machine import in_threads
 
 MARGIN = 0.06  #: around the object in a crop [size of the object]
@@ -89,8 +89,9 @@ def write_posed_picture(writer: Writer, posed: PosedPicture, window: Window) -> 
     camera = posed.lens.camera(posed.pose)
     camera = camera._replace(centre=camera.centre - [left, top], size=(width, height))
     files = Files(filename, mask, valid)
-    return photograph_element(Shot(picture.name, camera, posed.light, posed.falloff, response=Response(posed.gamma),
-                                   files=files, encoding=encoding, saturation=picture.saturation))  # fmt: skip
+    response = Response(ToneCurve(posed.gamma))
+    return photograph_element(Shot(picture.name, camera, posed.light, posed.falloff, response=response, files=files,
+                                   encoding=encoding, saturation=picture.saturation))  # fmt: skip
 
 
 def write_table(

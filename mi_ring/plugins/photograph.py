@@ -9,7 +9,7 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.properties import LARGEST, beside_scene, number, number_list
 from mi_ring.rendering.pinhole import Pinhole
 from mi_ring.scene.lights import LAMP_CLASSES, light_of
-from mi_ring.scene.shot import Files, Response, Shot
+from mi_ring.scene.shot import Files, Response, Shot, ToneCurve
 
 #: Time of a photograph's rays. Other sensors have times of 0 and later: by the time the flash tells them apart.
 SHUTTER = -1.0
@@ -47,7 +47,8 @@ class Photograph(mi.Sensor):
     ``gamma``        float        exponent of the camera's curve: a pixel, decoded by ``encoding``, is
                                   radiance to this power. Default: 1
     ``contrast``     float        exponent c of the camera's S-curve: after ``gamma``, an sRGB value v
-                                  is recorded as vᶜ / (vᶜ + (1 − v)ᶜ). Default: 1, no S-curve
+                                  is recorded as vᶜ / (vᶜ + (eᵗ (1 − v))ᶜ). Default: 1
+    ``toe``          float        t of it: above 0, the dark end of the curve is longer. Default: 0
     ``vignetting``   float        exponent of the lens' vignetting: a pixel records radiance times the
                                   cosine between its ray and the optical axis to this power.
                                   Default: 0, none
@@ -120,12 +121,13 @@ class Photograph(mi.Sensor):
         if self.encoding not in ("auto", "srgb", "linear"):
             raise ValueError(f'{what}: encoding is "{self.encoding}", must be "srgb" or "linear"')
         self.saturation = number(props, "saturation", 1.0, positive=True)
-        curve = (number(props, name, 1.0, positive=True) for name in ("gamma", "contrast"))
+        gamma, contrast = (number(props, name, 1.0, positive=True) for name in ("gamma", "contrast"))
+        curve = ToneCurve(gamma, contrast, number(props, "toe", 0.0))
         vignetting = number(props, "vignetting", 0.0)
         gain = number_list(props, "gain", (1, 3)) if "gain" in props else [1.0]
         if min(gain) < 1 / LARGEST:
             raise ValueError(f'{what}: gain is "{props["gain"]}", must be above 0')
-        self.response = Response(*curve, vignetting, tuple(np.broadcast_to(gain, 3).tolist()))
+        self.response = Response(curve, vignetting, tuple(np.broadcast_to(gain, 3).tolist()))
         self.falloff = mi.Float(number(props, "falloff", 0.0))
         tilt = number_list(props, "tilt", (2,)) if "tilt" in props else (0.0, 0.0)
         if max(map(abs, tilt)) > STEEPEST:

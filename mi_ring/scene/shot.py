@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mi_ring.geometry.camera import Camera, moved_pose
+from mi_ring.images import contrasted
 from mi_ring.scene.lights import Light
 
 #: How a file encodes linear values; `auto`: files of 8 bits are sRGB, all others are linear.
@@ -53,26 +54,57 @@ class Window(NamedTuple):
         return float(np.prod(self.extent) / np.prod(self.whole))
 
 
+class ToneCurve(NamedTuple):
+    """A camera's tone curve: linear values x ≥ 0 become S(x ^ `gamma`). By default it changes nothing.
+
+    S is an S-curve with `contrast` and `toe`, as `mi_ring.images.contrasted` takes them.
+    """
+
+    gamma: float = 1.0
+    contrast: float = 1.0
+    toe: float = 0.0
+
+    def applied(self, linear: np.ndarray) -> np.ndarray:
+        """Apply the curve to linear values of any shape."""
+        powers = linear if self.gamma == 1 else np.maximum(linear, 0) ** self.gamma
+        return contrasted(powers, self.contrast, self.toe) if self.bent else powers
+
+    def removed(self, recorded: np.ndarray) -> np.ndarray:
+        """Undo the curve: compute linear values from recorded ones of any shape."""
+        contrast, toe = 1 / self.contrast, -self.contrast * self.toe
+        powers = contrasted(recorded, contrast, toe).astype(recorded.dtype) if self.bent else recorded
+        return powers if self.gamma == 1 else np.maximum(powers, 0) ** (1 / self.gamma)
+
+    @property
+    def bent(self) -> bool:
+        """True if the curve has an S."""
+        return (self.contrast, self.toe) != (1, 0)
+
+    def after(self, first: "ToneCurve") -> "ToneCurve":
+        """Return one curve for `first` and then this one. The S-curve of `first` acts on values to this `gamma`."""
+        toe = first.toe + self.toe / first.contrast
+        return ToneCurve(first.gamma * self.gamma, first.contrast * self.contrast, toe)
+
+
+STRAIGHT = ToneCurve()  #: changes nothing
+
+
 @dataclass(frozen=True)
 class Response:
     """How a camera records radiance. With the default values, the recorded value is the radiance itself.
 
-    The recorded linear value is C((radiance · `gain` · cosine ^ `vignetting`) ^ `gamma`). C is an S-curve of exponent
-    `contrast` on the sRGB value v: v ↦ vᶜ / (vᶜ + (1 − v)ᶜ). The cosine is between the ray of the pixel and the optical
-    axis.
+    The recorded linear value is that of radiance · `gain` · cosine ^ `vignetting` under the `curve`. The cosine is
+    between the ray of the pixel and the optical axis.
     """
 
-    gamma: float = 1.0  #: exponent of the camera's curve
-    contrast: float = 1.0  #: of the camera's curve, as `mi_ring.images.contrasted` takes it
+    curve: ToneCurve = STRAIGHT
     vignetting: float = 0.0  #: exponent of the cosine between the ray of a pixel and the optical axis
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: factors of R, G, B, by exposure and white balance
 
-    def changed(
-        self, gamma: float = 1.0, contrast: float = 1.0, vignetting: float = 0.0, gain: ArrayLike = 1.0
-    ) -> "Response":
-        """Return a changed copy. `gamma`, `contrast` and `gain` multiply the old values; `vignetting` is added."""
+    def changed(self, first: ToneCurve = STRAIGHT, vignetting: float = 0.0, gain: ArrayLike = 1.0) -> "Response":
+        """Return a changed copy: with another curve `first`, more `vignetting` (added) and `gain` (multiplied)."""
         red, green, blue = np.multiply(self.gain, gain).tolist()
-        return Response(self.gamma * gamma, self.contrast * contrast, self.vignetting + vignetting, (red, green, blue))
+        return Response(self.curve.after(first), self.vignetting + vignetting, (red, green, blue))
 
 
 @dataclass(frozen=True, eq=False)
