@@ -15,7 +15,7 @@ from mi_ring.version import __version__
 
 NAME = "checkpoint.pt"
 BEFORE = "checkpoint.before.pt"  #: the previous checkpoint, in case the newest is damaged
-FORMAT = 10  #: of checkpoints; others are refused
+FORMAT = 11  #: of checkpoints; others are refused
 ADVICE = "run without --resume to start anew"
 
 
