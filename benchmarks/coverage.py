@@ -16,6 +16,7 @@ after an interruption.
 import argparse
 import datetime
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -39,8 +40,8 @@ SHOWN = 0.3  #: least correlation that is printed
 WITHIN = 1.645  #: standard deviations that hold nine of ten normally distributed errors
 
 
-def synthesized(mesh: str, material: str, number: int, out: Path, curve: ToneCurve) -> Path:
-    """A capture of a mesh, recorded with a tone curve. Returns its folder."""
+def synthesized(mesh: str, material: str, number: int, out: Path) -> Path:
+    """A capture of a mesh. Returns its folder."""
     if not (out / "truth/exact.xml").exists():
         options = ["--views", 24, "--novel", 0, "--size", 160, 160, "--cameras", "free", "--wrong-light", LIGHT,
                    "--wrong-power", POWER, "--format", "png8", "--spp", 25, "--seed", number]  # fmt: skip
@@ -48,9 +49,20 @@ def synthesized(mesh: str, material: str, number: int, out: Path, curve: ToneCur
             options += ["--room", ROOM, "--room-kind", "harmonics", "--wrong-room"]
         command = ["-m", "mi_ring.synthesize", mesh, out, "--material", material, *options]
         subprocess.run([sys.executable, *map(str, command)], check=True, stdout=subprocess.DEVNULL)
-        for file in (out / "images").iterdir() if curve != STRAIGHT else ():
+    return out
+
+
+def recorded(folder: Path, curve: ToneCurve) -> Path:
+    """A capture recorded with another curve than sRGB, beside its folder. Returns the new folder."""
+    out = folder.with_name("-".join(map(str, [folder.name, *curve])))
+    if not out.exists():
+        part = out.with_suffix(".part")
+        shutil.rmtree(part, ignore_errors=True)
+        shutil.copytree(folder, part, ignore=shutil.ignore_patterns("fit*"))
+        for file in (part / "images").iterdir():
             encoded = linear_to_srgb(curve.applied(srgb_to_linear(np.asarray(Image.open(file), float) / 255)))
             Image.fromarray((255 * encoded + 0.5).astype(np.uint8)).save(file)
+        part.rename(out)
     return out
 
 
@@ -95,7 +107,8 @@ def main() -> None:
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for k in range(options.count):
         mesh, material = (names[k % len(names)] for names in (options.meshes, options.materials))
-        folder = synthesized(mesh, material, k, options.out / str(k), curve)
+        folder = synthesized(mesh, material, k, options.out / str(k))
+        folder = folder if curve == STRAIGHT else recorded(folder, curve)
         out = folder / "-".join(["fit", *of_fit]).replace("/", "_")
         for pair in fitted(folder / "scene.xml", out, ["--preset", "fast", *of_fit])["correlations"]:
             correlations.setdefault(" and ".join(sorted(pair["options"])), []).append(pair["value"])

@@ -318,6 +318,30 @@ def test_powers_of_a_dark_colour_are_not_those_of_its_highlights(small_capture):
     assert after.isfinite().all() and [2, 1] not in changed and {k for k, _ in changed} <= {4, 7, 2}
 
 
+def test_exposures_of_photographs_of_other_sizes_are_compared(small_capture):
+    """An iteration shows one size alone. Here are three: one of them is that of a single photograph."""
+    fit, _ = posed(small_capture, refine=("power",))
+    calibration = fit.model.calibration
+    calibration.rig.sizes = [(10, 8)] * 7 + [(8, 10)] * 4 + [(9, 9)]
+    powers = ExposureSolver(calibration, "power")
+    random = torch.Generator().manual_seed(2)
+    factors = torch.rand(12, 3, generator=random) + torch.tensor([0.8] * 7 + [1.3] * 4 + [0.6])[:, None]
+    batches, inside = [[0, 3, 5], [7, 8, 10], [11], [1, 2, 4, 6], [8, 9]], torch.ones(4, 8, 10)
+    for number in range(150):
+        index = np.array(batches[number % 5])
+        predicted = calibration.value("power").detach()[index].exp()[:, None, None].expand(-1, 8, 10, 3) * 0.3
+        observed = (factors[index] * 0.2)[:, None, None].expand_as(predicted)
+        batch = SimpleNamespace(progress=0.5, photographs=index, all_photographs=index, share=ALONE.share(len(index)),
+                                stage=Stage(2, 28, 0, 9))  # fmt: skip
+        unclipped = torch.zeros_like(predicted, dtype=torch.bool)
+        seen = Observation(observed, unclipped, inside[: len(index)], torch.ones(len(index)).bool(), None)
+        rendered = SimpleNamespace(rgb=predicted, coverage=inside[: len(index)])
+        powers.look(Iteration(batch, seen, rendered, fit.context()))
+        powers.step()
+    found = calibration.value("power").detach()
+    torch.testing.assert_close(found - found.mean(0), factors.log() - factors.log().mean(0), atol=0.02, rtol=0)
+
+
 def test_only_what_quarters_of_photographs_have_in_common_is_exposure():
     """Their mean has the variance of the exposures and a quarter of that of the errors: by simulation."""
     random = np.random.default_rng(3)

@@ -55,10 +55,17 @@ def test_cameras_that_look_the_same_way_from_several_places_are_not_on_rings():
 
 def test_a_few_photographs_from_elsewhere_change_nothing():
     assert on_rings(np.concatenate([cameras("turntable", 40), cameras("free", 4)]))
+    made = cameras("turntable", 40, elevations=(20.0,))
+    made[[3, 11, 30], :3, 3] += [[0.1, -0.2, 0.1], [0.3, 0, 0.2], [-0.1, 0.1, 0.2]]  # wrong poses of the same ring
+    assert on_rings(made)
+
+
+def test_cameras_of_one_place_tell_nothing():
+    assert on_rings(np.tile(cameras("turntable", 3)[0], (9, 1, 1))) is None
 
 
 @pytest.mark.parametrize(("rings", "moves", "turned"), [
-    (True, False, True), (True, True, False), (True, None, None), (False, False, False),
+    (True, False, True), (True, True, False), (True, None, None), (False, False, False), (None, False, None),
 ])  # fmt: skip
 def test_an_object_turned_if_cameras_are_on_rings_and_the_background_stands_still(
     rings, moves, turned, small_capture, monkeypatch

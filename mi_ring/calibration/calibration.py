@@ -225,6 +225,7 @@ class Calibration(nn.Module):
         if lobes is not None:
             mean = mean + math.pi * torch.from_numpy(lobes.mean_radiance()).to(mean)
         own = (now.strengths / distance2)[self.rig.mainly].median(0).values
+        own = torch.where(own > 0, own, own.mean())  # a light may lack a colour
         return mean / own if bool((own > 0).all()) else mean / math.pi
 
     def prior(self) -> Tensor:

@@ -126,7 +126,7 @@ class RoomLight(nn.Module):
         self, around: GlobalIllumination, predicted: Tensor, observed: Tensor, counted: Tensor, progress: float = 1.0,
         total: Callable[[Tensor], Tensor] = lambda equations: equations,
     ) -> None:  # fmt: skip
-        """Add photographs to the normal equations, solve them, and set the harmonics to the solution.
+        """Add photographs to the normal equations, solve them, and set harmonics and fluxes to the solution.
 
         `around`: rendered pictures, one for the light of each harmonic and lobe. `predicted`, `observed` (N, H, W, 3):
         linear radiance. `predicted` must contain the current room light, reflected once; its harmonics without
@@ -178,6 +178,11 @@ class RoomLight(nn.Module):
         vector = torch.einsum("jnc,nc,n->cj", basis, missing, weight)
         return matrix.flatten(1), vector
 
+    @torch.no_grad()
+    def limit_sharpness(self) -> None:
+        """Keep the sharpness of lobes that a fit changes between the limits `SHARPNESS`."""
+        self.log_sharpness.clamp_(*map(math.log, SHARPNESS))
+
     def update(self, progress: float) -> None:
         """Set the light to the solution of the normal equations. Does nothing while they do not tell each harmonic."""
         told = self.matrix.diagonal(dim1=1, dim2=2)[:, self.used].mean(1)
@@ -186,7 +191,6 @@ class RoomLight(nn.Module):
         free = self.free if progress >= FINE else harmonics_up_to(BESIDE_FLASH, self.frames)
         self.harmonics = self.given.clone()
         if count := int(self.count):
-            self.log_sharpness.clamp_(*map(math.log, SHARPNESS))
             found = self.solved_with_lobes(self.matrix, self.vector, free, count)
             self.harmonics[free], self.flux[:count] = found
         else:

@@ -61,13 +61,16 @@ def real(file: Path | None) -> str:
 def camera_numbers(capture: Capture) -> np.ndarray:
     """Number the cameras of a capture. Returns (P,) int, the number of each photograph's camera.
 
-    In a capture with both kinds of photographs, those whose cameras are exactly equal have the same number. In all
-    other captures each photograph has a number of its own.
+    In a capture with both kinds of photographs, those whose cameras are equal have the same number. Differences from
+    rounding do not count. In all other captures each photograph has a number of its own.
     """
     if not capture.photographs.mixed:
         return np.arange(len(capture))
     known: dict[tuple, int] = {}
-    return np.array([known.setdefault(shot.whole.camera.key, len(known)) for shot in capture.shots])
+    cameras = [shot.whole.camera for shot in capture.shots]
+    # Crops of other sizes change the last digits of the lens.
+    rounded = [camera._replace(focal=camera.focal.round(3), centre=camera.centre.round(3) + 0.0) for camera in cameras]
+    return np.array([known.setdefault(camera.key, len(known)) for camera in rounded])
 
 
 def varies_in_exposure(capture: Capture) -> bool:

@@ -16,29 +16,30 @@ MOST_BESIDE = 0.1  #: largest share of cameras that are on no ring
 
 def object_turned(capture: Capture) -> bool | None:
     """Tell whether the object turned while the camera stood still. None: neither cameras nor backgrounds tell it."""
-    if not on_rings(np.stack([shot.camera.to_world for shot in capture.shots])):
-        return False
-    moves = background_moves(capture)
-    return None if moves is None else not moves
+    rings = on_rings(np.stack([shot.camera.to_world for shot in capture.shots]))
+    moves = background_moves(capture) if rings else None
+    return False if rings is False else None if moves is None else not moves
 
 
-def on_rings(poses: np.ndarray) -> bool:
-    """Test whether cameras may be one camera that stood still while the object turned about an axis.
+def on_rings(poses: np.ndarray) -> bool | None:
+    """Tell whether cameras may be one camera that stood still while the object turned about an axis.
 
     Then they are on rings about this axis, and each ring is one camera that is turned about it. Every ring has a camera
     of its own, which may have been moved before the next turn. `poses` (P, 4, 4) or (P, 3, 4): camera to world.
+
+    Returns None if all cameras look the same way from one place: then nothing turned.
     """
     turns, places = poses[:, :3, :3], poses[:, :3, 3]
     axis = axis_of(turns)
     if axis is None:
-        return False
+        return None if np.ptp(places, axis=0).max() == 0 else False
     left = np.arange(len(poses))
     axes = turns.swapaxes(1, 2) @ axis  # in the axes of each camera
     beside = 0
     while len(left):
         ring = left[axes[left] @ axes[left[0]] > np.cos(np.radians(ALIKE))]
         left = np.setdiff1d(left, ring)
-        beside += 0 if len(ring) >= FEWEST and is_ring(turns[ring], places[ring], axis) else len(ring)
+        beside += beside_ring(turns[ring], places[ring], axis) if len(ring) >= FEWEST else len(ring)
     return beside <= MOST_BESIDE * len(poses)
 
 
@@ -61,15 +62,18 @@ def axis_of(turns: np.ndarray) -> np.ndarray | None:
     return np.linalg.svd(most)[2][0]
 
 
-def is_ring(turns: np.ndarray, places: np.ndarray, axis: np.ndarray) -> bool:
-    """Test whether n cameras are one camera that is turned about an axis.
+def beside_ring(turns: np.ndarray, places: np.ndarray, axis: np.ndarray) -> int:
+    """Count how many of n cameras are not where one camera is that is turned about an axis.
 
     `turns` (n, 3, 3), `places` (n, 3): camera to world. `axis` (3,): its direction.
     """
     # A point c of the axis is at the same place k in the axes of all cameras: c - R k = place.
-    design = np.concatenate([np.concatenate([np.eye(3), -turn], 1) for turn in turns])
-    solution = np.linalg.lstsq(design, places.ravel(), rcond=None)[0]
-    wrong = np.linalg.norm((design @ solution).reshape(-1, 3) - places, axis=1)
+    design = np.stack([np.concatenate([np.eye(3), -turn], 1) for turn in turns])
+    wrong = np.zeros(len(turns))
+    for _ in range(2):  # the second time without the worst
+        good = wrong <= np.quantile(wrong, 1 - MOST_BESIDE)
+        solution = np.linalg.lstsq(design[good].reshape(-1, 6), places[good].ravel(), rcond=None)[0]
+        wrong = np.linalg.norm(design @ solution - places, axis=1)
     beside = places - solution[:3]
     away = np.linalg.norm(beside - (beside @ axis)[:, None] * axis, axis=1)
-    return bool((wrong <= NEAR * away.mean()).all())
+    return int((wrong > NEAR * away.mean()).sum())

@@ -125,6 +125,9 @@ def compare(at: Group, layout: Layout, colours: Equations, silhouettes: Equation
     `layout`: the places of all unknowns in the vector of parameters.
     """
     problem, calibration, index = at.problem, at.calibration, at.index
+    unknowns = layout.of(index)
+    if not (unknowns or layout.room):
+        return  # these photographs tell nothing
     seen = problem.capture.observe(index, at.scale)
     lit, coverage = at.direct()
     bounced, room_light, transfer = at.other(lit, coverage)
@@ -154,7 +157,7 @@ def compare(at: Group, layout: Layout, colours: Equations, silhouettes: Equation
         tensor.copy_(found)
         return result
 
-    slopes, unknowns = [], layout.of(index)  # of colours (n, H, W, 3) and coverage (n, H, W)
+    slopes = []  # of colours (n, H, W, 3) and coverage (n, H, W)
     for unknown in unknowns:
         sides = beside(*unknown, STEP), beside(*unknown, -STEP)
         slopes.append([(plus - minus) / (2 * STEP) for plus, minus in zip(*sides)])

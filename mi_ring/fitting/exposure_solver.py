@@ -7,6 +7,7 @@ A wrong surface or material makes a part of a photograph brighter than predicted
 the quarters of photographs have in common is taken for exposure.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +20,7 @@ PULL = 0.01  #: strength of the prior, relative to the photographs
 BRIGHT = 0.3  #: least radiance of compared pixels, relative to the object's median in that colour
 BLACK = 0.01  #: the same in units of the exposure
 ENOUGH = 30  #: least number of compared pixels
+FOLLOWING = 0.5  #: share by which the brightness of all photographs of one size follows that of a batch
 SEVERAL = 8  #: least number of photographs that tell how much exposures vary
 
 
@@ -32,7 +34,14 @@ class ExposureSolver(torch.optim.Optimizer):
         self.tensor, self.width = getattr(calibration, name), calibration.widths[name]
         self.exposed = {*calibration.rig.exposed[name].tolist()}  #: photographs whose power or gain is unknown
         super().__init__([{"params": [self.tensor]}], {"lr": self.rate.initial})
-        self.state[self.tensor] = {"measured": torch.zeros(len(calibration.rig), 5, 3)}
+        sizes, group = np.unique(calibration.rig.sizes, axis=0, return_inverse=True)
+        self.group = group.ravel()  #: (P,) number of each photograph's size
+        #: (sizes, 1, 1) photographs of each size whose power or gain is unknown
+        self.counts = torch.from_numpy(np.bincount(self.group[[*self.exposed]], minlength=len(sizes)))[:, None, None]
+        self.state[self.tensor] = {
+            "measured": torch.zeros(len(calibration.rig), 5, 3),
+            "brighter": torch.zeros(len(sizes), 5, 3),
+        }
         self.seen: list[int] = []  #: photographs of the last `look`
 
     @property
@@ -40,13 +49,19 @@ class ExposureSolver(torch.optim.Optimizer):
         """(P, 5, 3): log of the exposure as last seen, by colour: of all pixels, then of each quarter; 0: unknown."""
         return self.state[self.tensor]["measured"]
 
+    @property
+    def brighter(self) -> Tensor:
+        """(sizes, 5, 3): log of how much brighter photographs of each size are than predicted; 0: unknown."""
+        return self.state[self.tensor]["brighter"]
+
     @torch.no_grad()
     def look(self, it: Iteration) -> None:
         """Measure the exposure of each photograph of an iteration, and store it for `step`.
 
         The measure is the median of log(observed / predicted) over bright pixels of the object, for each colour, plus
         the exposure that the prediction has already. The mean over the photographs is subtracted, because the albedo
-        explains it.
+        explains it. Photographs of an iteration have one size. How much brighter those of other sizes are is known from
+        earlier iterations.
         """
         self.seen = []
         if it.progress < START:
@@ -68,14 +83,28 @@ class ExposureSolver(torch.optim.Optimizer):
                     if len(values) >= (ENOUGH if part == 0 else ENOUGH // 4):
                         brighter[n, part, colour] = values.median()
         brighter = it.batch.share.gathered(brighter)
-        several = (~brighter.isnan()).sum(0) >= 2  # of each part, in each colour
+        index = it.batch.all_photographs
+        group = self.group[index[0]]
+        fewest = 1 if len(self.counts) > 1 and self.counts[group] == 1 else 2
+        several = (~brighter.isnan()).sum(0) >= fewest  # of each part, in each colour
         # Of each part its own: errors of the parts would depend on each other otherwise.
         mean = torch.where(several, brighter.nanmean(0), torch.nan)
-        for k, one in zip(it.batch.all_photographs.tolist(), brighter - mean):
+        for k, one in zip(index.tolist(), brighter - mean + self.beside_others(group, mean)):
             if not one[0].isnan().all():
                 self.seen.append(k)
                 exposure = one + self.width * self.tensor[k]
                 self.measured[k] = torch.where(exposure.isnan(), self.measured[k], exposure)
+
+    def beside_others(self, group: int, mean: Tensor) -> Tensor:
+        """Return how much brighter (5, 3) photographs of a size are than those of all sizes; 0 if all have one size.
+
+        `group`: number of the size. `mean` (5, 3): that of its photographs in this iteration, NaN where unknown.
+        """
+        now = self.brighter[group]
+        followed = torch.where(now == 0, mean, now + FOLLOWING * (mean - now))
+        self.brighter[group] = torch.where(mean.isnan(), now, followed)
+        weights = torch.where(self.brighter != 0, self.counts, 0)
+        return self.brighter[group] - (weights * self.brighter).sum(0) / weights.sum(0).clamp(min=1)
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]

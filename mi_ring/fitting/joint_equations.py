@@ -69,7 +69,7 @@ class JointEquations:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """The covariance (N, N) of all parameters with their priors. Powers and gains have mean 1."""
+        """The covariance (N, N) of all parameters with their priors. Logarithms of powers and gains have mean 0."""
         centring = self.layout.centring()
         return centring @ np.linalg.inv(np.eye(self.layout.count) + self.matrix) @ centring.T
 

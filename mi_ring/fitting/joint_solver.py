@@ -45,7 +45,10 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
     # With other lights the derivatives by a power would be those of all light.
     alone = rig.flash is not None and rig.lit.all() and not shared_emitters(problem.capture.scene)
     names = [name for name in SOLVED if name in calibration.unknowns and alone]
-    most = None if {"power", "gain"} & {*names} else MOST
+    names = names if {"power", "gain"} & {*names} else []  # a flash alone is found by its gradient
+    if not (names or "ambient" in calibration.refined):
+        return {}
+    most = None if names else MOST
     joint = JointEquations.of(problem, model, renderer, level, most, WIDTH)
     layout, unit = joint.layout, ROOM * problem.exposure
     here = layout.places("ambient")

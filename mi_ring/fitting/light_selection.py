@@ -18,7 +18,7 @@ from mi_ring.fitting.problem import held_out_photographs
 from mi_ring.rendering.spherical_harmonics import PER_FRAME, envmap_directions, world_harmonics
 from mi_ring.system.progress import progress
 
-#: Settings of a coarse fit. They do not depend on those of the fit: neither does the choice.
+#: Settings of a coarse fit that do not depend on those of the fit.
 COARSE: dict[str, Any] = {
     "levels": (3,), "widths": (64,), "shares": (1.0,), "iterations": 60, "holdout": 0, "detail": "none",
     "lobes": "1", "small_lights": 0,

@@ -32,7 +32,7 @@ class Layout:
         return self.first[name] + np.arange(count)
 
     def values(self) -> np.ndarray:
-        """Return the current parameters (N,). Powers and gains have mean 1. The room's light counts as 0."""
+        """Return the current parameters (N,). Powers and gains have mean 0. The room's light counts as 0."""
         unknowns = [getattr(self.calibration, name) for name in self.calibration.widths]
         values = [unknown.double().numpy(force=True).ravel() for unknown in unknowns]
         return self.centring() @ np.concatenate([*values, np.zeros(3 * len(self.room))])

@@ -159,6 +159,8 @@ class Optimisation:
                 optimizer.step(lambda: self.backward(*evaluate()))
             elif healthy:
                 optimizer.step()
+        if calibration and finds_small_lights(calibration, self.problem.config):
+            calibration.room.limit_sharpness()
         if not self.guard.note(healthy):
             option = "--muon-rate" if self.problem.config.optimizer == "muon" else "--learning-rate"
             option = "--detail-rate" if it.stage.detail else option
