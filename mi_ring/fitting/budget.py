@@ -98,11 +98,11 @@ def seconds_per_iteration(stage: Stage, stages: Sequence[Stage], costs: Costs) -
     """Return the time [s] of an iteration of a stage, one of `stages`. `costs`: of the others; details are estimated.
 
     An iteration for details takes as long as one of the stage before at a mesh level finer by 1, and half as long for
-    each level less: it has fewer photographs.
+    each level less: it has fewer photographs. What `costs` do not tell counts as 1.
     """
     before = next(other for other in reversed(stages) if not other.detail) if stage.detail else stage
     finer = 2.0 ** (stage.level - before.level - 1) if stage.detail else 1.0
-    return finer * costs[before.level, before.width]
+    return finer * costs.get((before.level, before.width), 1.0)
 
 
 def seconds_around(config: Config, plan: Planner, costs: Costs) -> float:

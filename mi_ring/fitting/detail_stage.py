@@ -15,6 +15,7 @@ from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import MAX_LEVEL
 
 SPACING, CELL = 1.2, 1.25  #: of the finest mesh's vertices, and side of the finest cubes [px]
+FEWEST_PHOTOGRAPHS = 4  #: that show whether they agree on details
 OCTAVES = 4  #: of the grids: the coarsest cubes are as large as what the networks represent
 STEEPEST, HALVINGS = 0.2, 8  #: least cosine between a triangle with and without details; see `unfold`
 

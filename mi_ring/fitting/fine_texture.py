@@ -19,7 +19,7 @@ import trimesh
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import read_photograph
 from mi_ring.capture.observation import Observation, observed
-from mi_ring.capture.reduction import reduced_image, windowed
+from mi_ring.capture.reduction import HIGHEST, reduced_image, windowed
 from mi_ring.fitting.surface_ratios import Points, Ratios, bilinear
 from mi_ring.geometry.camera import pixels_per_unit
 from mi_ring.geometry.hull import evenly_spaced
@@ -57,12 +57,13 @@ def chosen_photographs(given: Capture, fitted: Sequence[int] | np.ndarray) -> li
 
 
 def texture_width(given: Capture, index: Sequence[int]) -> int:
-    """Choose the width to which photographs are reduced for the texture [px]. Returns 0 if there are none.
+    """Choose the largest width of photographs for the texture [px]; higher ones are narrower. Returns 0 for none.
 
     `given`: the capture of the fit, which may be reduced. `index`: the result of `chosen_photographs`.
     """
     shots = [given.shots[k] for k in index]
-    return min(WIDEST, max((shot.window.extent[0] if shot.window else shot.size[0] for shot in shots), default=0))
+    sizes = [shot.window.extent if shot.window else shot.size for shot in shots]
+    return min(WIDEST, max((max(width, math.ceil(height / HIGHEST)) for width, height in sizes), default=0))
 
 
 def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray) -> float:
@@ -217,7 +218,9 @@ def sharpened(
 
     for _ in progress(pipelined(predicted, compare, index), "texture", len(index)):
         pass
-    coarse, fine = COARSE * max(1.0, widest / width), CELL * max(1.0, wanted / divisions)  # in pixels
+    own = [at_width(before.shots[k], refined.shots[k], min(width, widest))[1].camera for k in index]
+    coarser = resolution / pixels_per_unit(own, ring.center.cpu().numpy())
+    coarse, fine = COARSE * max(1.0, coarser), CELL * max(1.0, wanted / divisions)  # in pixels
     grid = ratios.texture(predictor.s, coarse / scale, fine / scale)
     if grid is None:
         return ring

@@ -137,7 +137,7 @@ class Fit(Renamed):
 
     def refine_masks(self) -> None:
         """Find new masks near the outline of the current surface. They replace the masks in `capture` of this fit."""
-        parts = self.capture, self.problem.exposure, self.model, self.renderer, self.schedule.final_level
+        parts = self.capture, self.problem.exposure, self.model, self.renderer, self.problem.config.levels[-1]
         self.course.masks |= self.problem.processes.on_first(lambda: find_masks(*parts))
         self.capture = with_masks(self.problem.capture, self.course.masks)
 

@@ -7,7 +7,7 @@ from torch import nn
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Capture
-from mi_ring.fitting.detail_stage import add_detail, detail_levels, fit_resolution, share_weights
+from mi_ring.fitting.detail_stage import FEWEST_PHOTOGRAPHS, add_detail, detail_levels, fit_resolution, share_weights
 from mi_ring.fitting.lighting import room_frames
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import Refinement
@@ -38,7 +38,9 @@ class Model(nn.Module):
             self.calibration.room.to(problem.device)
         self.starts_near = not isinstance(ring.domain, Sphere)  #: from a hull or a mesh
         self.resolution = fit_resolution(problem, center, float(ring.radius))  #: of the photographs
-        self.detail_levels = detail_levels(ring, self.resolution)  #: of the meshes for details, from coarse to fine
+        several = len(problem.fitted) >= FEWEST_PHOTOGRAPHS
+        #: of the meshes for details, from coarse to fine
+        self.detail_levels = detail_levels(ring, self.resolution) if several else []
         share_weights(ring)
         self.to_freeze = [p for p in ring.shape_net.parameters() if p.requires_grad]
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from mi_ring.capture.capture import Capture
-from mi_ring.errors import InputError
 from mi_ring.fitting.course import Course
 from mi_ring.fitting.fine_texture import sharpened
 from mi_ring.fitting.joint_equations import JointEquations
@@ -19,6 +18,7 @@ from mi_ring.fitting.summary import summary
 from mi_ring.fitting.validation import texture_helps
 from mi_ring.output.fit_result import FitResult
 from mi_ring.scene.assembly import lamp_lights
+from mi_ring.system.command import interrupted
 from mi_ring.system.machine import release_memory
 
 SAME = 1e-5  #: relative difference below which room light is nothing but the scene's own environment
@@ -55,8 +55,10 @@ def result_of(
                 ring = sharp
             else:
                 print("The texture is left out: it does not improve the prediction of held-out photographs")
-        except InputError as error:  # a file has gone; all else can be saved
-            print(f"There is no texture: {error}")
+        except Exception as error:  # a file has gone, memory is full; all else can be saved
+            if interrupted():
+                raise
+            print(f"There is no texture: {error or type(error).__name__}")
     return FitResult(
         ring=ring,
         surface=renderer.show(model, ring.subdivisions),

@@ -64,7 +64,8 @@ class Sampler:
         stage = schedule.stage(iteration)
         resample = problem.config.resample and not stage.detail
         points, faces = domain.sample(stage.level, self.random["rotations"] if resample else None)
-        everyone, size = self.draw_photographs(problem.config.batch, RAYS // stage.width**2 if stage.detail else None)
+        most = RAYS // stage.width**2 if stage.detail else None
+        everyone, size = self.draw_photographs(problem.config.batch, most)
         seeds = {name: int(torch.randint(2**31, (), generator=self.random[name])) for name in SEEDED}
         share = problem.processes.share(len(everyone))
         return Batch(iteration + 1, schedule.progress(iteration), schedule.detail_progress(iteration), stage,
@@ -74,12 +75,15 @@ class Sampler:
     def draw_photographs(self, count: int, most: int | None = None) -> tuple[np.ndarray, tuple[int, int]]:
         """Draw `count` photographs of one size, or all photographs of this size if there are fewer.
 
+        `most`: draw at most so many, and at most a quarter of this size: so details see others in each iteration.
         Returns (their indices, their size (width, height) [px]).
         """
         random = self.random["photographs"]
         size = self.sizes[int(torch.randint(len(self.sizes), (), generator=random))]
         alike, waiting = self.alike[size], self.waiting.get(size, [])
-        count = min(count, len(alike), max(1, most or count))
+        count = min(count, len(alike))
+        if most is not None:
+            count = max(1, min(count, most, len(alike) // 4))
         if len(waiting) < count:  # the remaining ones come first, and last in the next round
             order = alike[torch.randperm(len(alike), generator=random).numpy()].tolist()
             waiting = waiting + [k for k in order if k not in waiting] + waiting

@@ -16,7 +16,7 @@ import trimesh
 from tqdm import tqdm
 
 from mi_ring.errors import InputError
-from mi_ring.fitting.budget import Costs, measure
+from mi_ring.fitting.budget import Costs, measure, seconds_per_iteration
 from mi_ring.fitting.checkpoint import BEFORE, digests, write_checkpoint
 from mi_ring.fitting.coat_selection import described
 from mi_ring.fitting.fit import Fit
@@ -162,7 +162,8 @@ def train(fit: Fit, keeper: Keeper, interrupted: Callable[[], int], costs: Costs
         left = [stage for stage in fit.schedule.stages if stage.last > fit.iteration]
         costs = fit.problem.processes.broadcast(measure(fit, left, interrupted))
     stages = fit.schedule.stages
-    work = [(costs or {}).get((s.level, s.width), 1.0) for s in stages for _ in range(s.first, s.last)]
+    each = [seconds_per_iteration(stage, stages, costs) if costs else 1.0 for stage in stages]
+    work = [seconds for stage, seconds in zip(stages, each) for _ in range(stage.first, stage.last)]
     bar = progress(
         None, total=sum(work), initial=sum(work[: fit.iteration]), smoothing=0.1, leave=True,
         bar_format="{desc} |{bar:20}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}",

@@ -80,19 +80,20 @@ def validate(problem: Problem, model: Model, renderer: Renderer, level: int) -> 
     """
     calibration, reset = model.calibration, []
 
-    def now() -> float:
+    def now(width: int = COMPARED_WIDTH) -> float:
         model.update_albedo()
         surface, capture = renderer.show(model, level), model.calibrated(problem.capture)
-        return unexplained(problem, capture, surface, model.ring.indirect, COMPARED_WIDTH)
+        return unexplained(problem, capture, surface, model.ring.indirect, width)
 
     found = now()
     if math.isnan(found):
         return {"put_back": []}
     if model.detailed:
-        detailed = model.remove_detail()
-        without = now()
-        if without <= found:
-            found, reset = without, ["detail"]
+        width = max(COMPARED_WIDTH, *problem.config.widths)  # smaller pictures do not show details
+        with_details, detailed = now(width), model.remove_detail()
+        if now(width) <= with_details:
+            found, reset = now(), ["detail"]
+            model.ring.subdivisions = problem.config.subdivisions
             for network in detailed:
                 network.base.release()  # type: ignore[union-attr, operator]  # torch's types of modules
         else:

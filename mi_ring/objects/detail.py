@@ -25,6 +25,7 @@ AT_ONCE = 2**16  #: points whose weights are computed at once
 PART = 2**20  #: points whose weights are kept: more than a mesh of a fit has, fewer than one to export may have
 #: Factor of what details add to gloss. Few photographs show a highlight: a larger change would not suit the others.
 GLOSS = 1 / 3
+OPPOSITE = 0.3  #: normals cancel if the length of their sum is below this share of the sum of their lengths
 MOST = 2**20  #: coordinates of cubes are from -`MOST` to `MOST` - 1
 PLACES = torch.tensor([2**42, 2**21, 1])  #: a key is the scalar product of these and of coordinates from -`MOST`
 
@@ -223,13 +224,17 @@ class DetailedFlow(Flow):
         """Add a displacement to `flow`, which is frozen.
 
         The displacement is along the `normals` (V, 3) of the surface at domain `points` (V, 3). Longer normals have
-        more weight in the mean direction of a corner.
+        more weight in the mean direction of a corner. Where the object is thinner than a cube, normals of both sides
+        would cancel: there this octave has no displacement.
         """
         detailed = cls(architecture_of(flow), grid.arguments())
         detailed.base, detailed.grid = Remembered(flow), grid
         for k, weights in enumerate(grid.weights(points)):
             mean = torch.from_numpy(weights.T @ normals.numpy(force=True))
-            getattr(detailed, f"directions{k}").copy_(nn.functional.normalize(mean, dim=1))
+            most = torch.from_numpy(weights.T @ normals.norm(dim=1).numpy(force=True))
+            opposite = mean.norm(dim=1) < OPPOSITE * most
+            directions = nn.functional.normalize(mean, dim=1).masked_fill(opposite[:, None], 0.0)
+            getattr(detailed, f"directions{k}").copy_(directions)
         return detailed
 
     def arguments(self) -> dict:
@@ -287,4 +292,6 @@ class DetailedMaterial(MaterialNet):
 
     def evaluate(self, s: Tensor) -> Tensor:
         factors = [1.0 if p.channels == 3 else GLOSS for p in self.bsdf_parameters for _ in range(p.channels)]
-        return self.base(s).float() + self.grid(s) * torch.tensor(factors, device=s.device)
+        points = s.reshape(-1, 3)
+        result = self.base(points).float() + self.grid(points) * torch.tensor(factors, device=s.device)
+        return result.reshape(*s.shape[:-1], -1)

@@ -125,7 +125,7 @@ def draw(
         with without_gloss(surface) as is_other:
             how = spp, seed, shadows, indirect, paths, occlusion
             matte = draw(surface, photographs, *how)[0] if is_other else rgb.cpu()
-        rgb = rgb.cpu() + matte * (texture_factors(surface, photographs, seed) - 1)
+        rgb = rgb.cpu() + matte * (texture_factors(surface, photographs, seed, max(spp, TEXTURE_RAYS)) - 1)
     return rgb.cpu(), coverage.cpu()
 
 
@@ -145,11 +145,11 @@ def without_gloss(surface: Surface) -> Iterator[bool]:
 
 
 @torch.no_grad()
-def texture_factors(surface: Surface, photographs: Photographs, seed: int = 0) -> Tensor:
-    """Compute the factors (N, H, W, 3) by which the texture changes the matte light of pixels."""
+def texture_factors(surface: Surface, photographs: Photographs, seed: int = 0, rays: int = TEXTURE_RAYS) -> Tensor:
+    """Compute the factors (N, H, W, 3) by which the texture changes the matte light of pixels, from `rays` in each."""
     own, s, parts = photographs.in_units(surface.unit), surface.s.numpy(force=True), []
-    for pixels in photographs.chunks(TEXTURE_RAYS):
-        hits = find_triangles(surface.scene, surface.shape, own, TEXTURE_RAYS, seed, pixels)
+    for pixels in photographs.chunks(rays):
+        hits = find_triangles(surface.scene, surface.shape, own, rays, seed, pixels)
         shown, triangle, *place = map(np.array, hits)
         u, v = (share[shown, None] for share in place)
         a, b, c = surface.faces[triangle[shown]].T
@@ -157,8 +157,8 @@ def texture_factors(surface: Surface, photographs: Photographs, seed: int = 0) -
         if shown.any():
             points = torch.from_numpy((1 - u - v) * s[a] + u * s[b] + v * s[c])
             factors[torch.from_numpy(shown)] = surface.texture(points)
-        number = torch.from_numpy(shown).reshape(-1, TEXTURE_RAYS).sum(1, keepdim=True)
-        mean = factors.reshape(-1, TEXTURE_RAYS, 3).sum(1) / number.clamp(min=1)
+        number = torch.from_numpy(shown).reshape(-1, rays).sum(1, keepdim=True)
+        mean = factors.reshape(-1, rays, 3).sum(1) / number.clamp(min=1)
         parts.append(torch.where(number > 0, mean, 1.0))
     return torch.cat(parts).reshape(*photographs.shape, 3)
 
