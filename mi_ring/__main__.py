@@ -15,8 +15,8 @@ from mi_ring.version import __version__
 
 #: Modules of the package. The first line of each docstring says what the command does and how to call it.
 COMMANDS = (
-    "example", "synthesize", "board", "photos", "convert", "check", "fit", "batch", "render", "export", "evaluate",
-    "paper", "validate", "doctor",
+    "example", "synthesize", "board", "photos", "convert", "join", "check", "fit", "batch", "render", "export",
+    "evaluate", "paper", "validate", "doctor",
 )  # fmt: skip
 
 

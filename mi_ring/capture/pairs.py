@@ -46,11 +46,16 @@ def room_photograph(shot: Shot, names: set[str]) -> Shot:
 
     `names`: names of photographs, which it must not have.
     """
-    name = f"{shot.name}_room"
+    files = shot.files._replace(filename=shot.files.ambient, ambient=None)
+    name = free_name(f"{shot.name}_room", names)
+    return replace(shot, name=name, light=shot.own_light._replace(rgb=np.zeros(3)), files=files)
+
+
+def free_name(name: str, names: set[str]) -> str:
+    """Return a name that is not in `names`: `name`, with as many underscores at its end as that takes."""
     while name in names:
         name += "_"
-    files = shot.files._replace(filename=shot.files.ambient, ambient=None)
-    return replace(shot, name=name, light=shot.own_light._replace(rgb=np.zeros(3)), files=files)
+    return name
 
 
 def real(file: Path | None) -> str:
