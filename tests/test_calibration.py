@@ -607,6 +607,21 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
     assert [s.files for s in read.shots] == [s.files for s in capture.shots]
 
 
+def test_photographs_without_ids_keep_their_own_cameras(small_capture, tmp_path):
+    scene = ElementTree.fromstring(small_capture.read_bytes())
+    for sensor in scene.findall("sensor"):
+        del sensor.attrib["id"]
+    path = small_capture.parent / "nameless.xml"
+    path.write_bytes(ElementTree.tostring(scene))
+    capture = mi_ring.load_capture(path, images=False)
+    path.write_bytes(recalibrated_xml(path.read_bytes(), capture.shots, None))
+    again = mi_ring.load_capture(path, images=False)
+    path.unlink()
+    assert len({shot.camera.key for shot in again.shots}) == len(again.shots) == 12
+    for one, other in zip(again.shots, capture.shots):
+        np.testing.assert_allclose(one.camera.to_world, other.camera.to_world, atol=1e-4)
+
+
 def test_a_fit_finds_a_flash_that_is_not_where_it_is_said_to_be(small_capture, tmp_path):
     wrong = np.array([-6.0, -16.0, 4.0])  # beyond a tenth of the distance
     scene = edited(small_capture, tmp_path / "wrong", lambda element: move_light(element, wrong))

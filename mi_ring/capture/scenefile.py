@@ -230,7 +230,7 @@ def photographs_of(root: Element, shots: Sequence[Shot]) -> list[tuple[Element, 
     because ids are missing.
     """
     elements = root.findall(".//sensor[@type='photograph']")
-    named = {shot.name: k for k, shot in enumerate(shots)}
+    named = {shot.name: k for k, shot in enumerate(shots) if shot.name}
     if len(elements) > len(shots):  # the capture is a part of the scene's photographs
         for parent in [root, *root.iter()]:
             for other in [e for e in parent if e in elements and e.get("id", "") not in named]:
