@@ -14,7 +14,7 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.normal_equations import BLOCK, Equations, Layout
 from mi_ring.metrics.capture_findings import moved_far
-from mi_ring.output.ambiguity import hardly_told_apart
+from mi_ring.output.ambiguity import hardly_told, hardly_told_apart
 from mi_ring.output.calibration_panel import panel
 
 
@@ -150,6 +150,9 @@ def test_what_photographs_hardly_tell_apart_is_said(small_capture):
     values = {frozenset(pair[:2]): pair[2] for pair in found}
     assert len(found) == len(values) == 3 and values.pop(frozenset(["light", "curve"])) == pytest.approx(0.97)
     assert max(values.values()) < 1e-6
+    joint = JointEquations(layout, np.diag([40.0, 0.0, 0.0, 0.9, 0.8, *[0.0] * (layout.count - 5)]), np.zeros(5))
+    assert joint.untold() == ["curve"]  # of the flash one axis is told
+    assert hardly_told(["curve", "scale"]) == "The photographs hardly tell curve and scale: the prior does."
     told = [{"options": [one, other], "value": value} for one, other, value in found]
     assert re.fullmatch(
         r"The photographs hardly tell apart \w+ and \w+ \(correlation 0.97\)\.", hardly_told_apart(told)

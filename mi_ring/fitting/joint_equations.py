@@ -23,6 +23,7 @@ from mi_ring.geometry.hull import evenly_spaced
 
 COMPARED_WIDTH = 96  #: largest width of the compared pictures [px]
 LEVEL = 5  #: of the mesh in them, at most
+UNTOLD = 0.7  #: share of a prior's standard deviation
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,18 @@ class JointEquations:
         if layout.room:
             result["ambient"] = ROOM * exposure * spread[layout.places("ambient")][:3]
         return result
+
+    def untold(self) -> list[str]:
+        """List the options of `--refine` of which photographs tell hardly more than the priors.
+
+        Of each component of the option's unknowns at least `UNTOLD` of the prior's standard deviation is left. Unknowns
+        of single photographs are left out.
+        """
+        spread, least = np.sqrt(np.diag(self.covariance)), dict[str, float]()
+        for name, unknown in self.layout.calibration.unknowns.items():
+            if not unknown.single:
+                least[unknown.option] = min(least.get(unknown.option, 1.0), *spread[self.layout.places(name)])
+        return [option for option, left in least.items() if left >= UNTOLD]
 
     def correlations(self) -> list[tuple[str, str, float]]:
         """List all pairs of options of `--refine`, and how much their unknowns look alike in the photographs, 0 to 1.

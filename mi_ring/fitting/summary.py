@@ -23,6 +23,7 @@ def summary(problem: Problem, model: Model, refined: Capture, joint: JointEquati
     `refined`: list of the refined options. `light`: kind of the light. `unknowns`: a dict with, for each unknown that
     photographs share, its meaning (`what`), its value `before` and `after` the fit, and its standard deviation `std`.
     `correlations`: a list of pairs of options, with how much their unknowns look alike in the photographs, 0 to 1.
+    `untold`: the options of which photographs tell hardly more than the priors.
     `photographs`: a dict with, for each fitted photograph, how far the object has moved in it (`moved_px`) and the
     values of its own unknowns.
     """
@@ -73,4 +74,4 @@ def summary(problem: Problem, model: Model, refined: Capture, joint: JointEquati
         photographs[capture.names[k]] = own | {"std": std}
     return {"refined": list(calibration.refined), "light": str(problem.lighting), "unknowns": unknowns,
             "correlations": [{"options": [one, other], "value": value} for one, other, value in joint.correlations()],
-            "photographs": photographs}  # fmt: skip
+            "untold": joint.untold(), "photographs": photographs}  # fmt: skip

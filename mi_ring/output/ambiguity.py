@@ -30,6 +30,11 @@ def hardly_told_apart(correlations: list[dict[str, Any]]) -> str:
     return f"The photographs hardly tell apart {', '.join(pairs)}." if pairs else ""
 
 
+def hardly_told(untold: list[str]) -> str:
+    """Return a warning about unknowns that stay as uncertain as before. `untold`: those of calibration.json."""
+    return f"The photographs hardly tell {' and '.join(untold)}: the prior does." if untold else ""
+
+
 def ambiguity_of(run: Path) -> str:
     """Return a warning about what a fit under unknown light could not determine; empty if the light was given.
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mi_ring.capture.capture import Capture
 from mi_ring.images import linear_to_srgb
-from mi_ring.output.ambiguity import ambiguity, hardly_told_apart
+from mi_ring.output.ambiguity import ambiguity, hardly_told, hardly_told_apart
 from mi_ring.output.svg import new_figure, svg_uri
 from mi_ring.rendering.spherical_harmonics import PER_FRAME, room_envmap
 from mi_ring.scene.assembly import lamp_lights
@@ -39,7 +39,8 @@ def panel(before: Capture, after: Capture, refined: dict[str, Any]) -> Panel:
     if light != "capture":
         rows.insert(0, ("kind of light, by coarse fits", "", light, ""))
     rows += small_lights(after) + [row(entry) for entry in of_photographs(refined["photographs"])]
-    untold = f"{ambiguity(light)} {hardly_told_apart(refined.get('correlations', []))}".strip()
+    texts = ambiguity(light), hardly_told_apart(refined.get("correlations", [])), hardly_told(refined.get("untold", []))
+    untold = " ".join(filter(None, texts))
     return Panel(rows, chart(before, after, refined["photographs"]), untold)
 
 
