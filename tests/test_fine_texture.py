@@ -147,10 +147,11 @@ def test_pictures_and_maps_show_it(sharp, print_scene):
     capture = load_capture(print_scene)
     surface = Surface(capture.scene, capture.shape, sharp)
     surface.show(sharp, *sharp.domain.sample(5))
-    pictures = [prediction.draw(surface, capture.photograph(0))[0][0].numpy() for _ in range(2)]
+    rays = prediction.TEXTURE_RAYS  # as many as in maps
+    pictures = [prediction.draw(surface, capture.photograph(0), rays)[0][0].numpy() for _ in range(2)]
     diffuse = prediction.maps(surface, capture.photograph(0))["diffuse"][0]
     surface.texture = None
-    plain = prediction.draw(surface, capture.photograph(0))[0][0].numpy()
+    plain = prediction.draw(surface, capture.photograph(0), rays)[0][0].numpy()
     seen = capture.observe([0]).rgb[0].numpy()
     inside = plain.min(-1) > 0.1 * np.quantile(plain, 0.9)
     textured, smooth = (
