@@ -15,6 +15,9 @@ from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.geometry import hull
 from mi_ring.metrics import capture_findings, mask_agreement
+from mi_ring.metrics.brightness_samples import Sampler
+from mi_ring.output import inspection
+from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.system import command
 
 
@@ -271,27 +274,26 @@ def test_a_bright_background_harms_nothing_with_masks_and_is_an_error_without(br
         assert status == 1 and "Problem: no masks, and the background is not dark" in text and "mi-ring photos" in text
 
 
-def test_light_of_the_room_is_told_from_the_falloff():
-    """What an object of uneven albedo looks like at 24 distances, with and without a light that stays."""
-    random = np.random.default_rng(6)
-    received = 1 / random.uniform(0.8, 1.4, 24) ** 2
-    albedo = random.normal(0.5, 0.01, 24)
-    for room in (0.0, 0.15):
-        share = capture_findings.room_light(albedo * (received + room) / received, received)
-        assert share == pytest.approx(room / (np.median(received) + room), abs=0.05)
-    assert capture_findings.room_light(albedo * 1.15, np.ones(24)) == 0  # all from one distance
-
-
-@pytest.mark.parametrize(("clipped", "found"), [(0.0, True), (0.2, False)])
-def test_over_exposed_photographs_do_not_tell_the_light_of_the_room(small_capture, monkeypatch, clipped, found):
-    """All are equally bright, whatever the distance of the flash."""
+def test_brightness_is_sampled_with_the_light_that_points_get(small_capture):
+    """Points of a matt object reflect one share of their irradiance, but where the hull is not the object."""
     capture = load_capture(small_capture)
-    received = np.linspace(1, 2, len(capture))
-    monkeypatch.setattr(capture_findings, "received_by", lambda capture, center: received)
-    rows = [replace(row, brightness=1 / e, clipped=clipped, angle=5.0)
-            for row, e in zip(capture_findings.measure(capture, np.zeros(3), 1.0, {}), received)]  # fmt: skip
-    text = "\n".join(capture_findings.capture_findings(capture, rows, np.zeros(3)))
-    assert ("as if 100% of the light came from the room, or" in text) == found
+    center, radius = capture.sphere()
+    sampler = Sampler.of(capture, center, radius)
+    capture_findings.measure(capture, center, radius, {}, sampler)
+    samples = sampler.samples()
+    shown = np.isfinite(samples.brightness) & (samples.cosine > 0.5)
+    with np.errstate(invalid="ignore"):
+        reflected = np.where(shown, np.log(samples.brightness / samples.irradiance / samples.cosine), np.nan)
+    often = shown.sum(0) >= 3
+    assert len(samples.falloff) == len(capture) and shown.sum(1).min() >= 50 and often.sum() > 100
+    assert np.median(np.nanstd(reflected[:, often], 0)) < 0.1 < 0.2 < np.nanstd(np.log(samples.brightness[shown]))
+    assert not Sampler.of(replace(capture, room=np.ones((BASIS, 3))), center, radius).chosen  # a room is known
+
+
+def test_what_brightness_tells_is_a_finding(small_capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(inspection, "light_findings", lambda samples: [f"{len(samples.falloff)} photographs are odd"])
+    status, text = run(small_capture, tmp_path, capsys)
+    assert status == 1 and "Problem: 12 photographs are odd" in text
 
 
 def test_without_masks(broken_capture, tmp_path, capsys):

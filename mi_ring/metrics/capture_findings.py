@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy  # its part stats, which takes half a second to import, is imported when it is used
 from scipy import ndimage
 
 from mi_ring.capture.brightness_masks import dark_threshold
@@ -14,10 +13,11 @@ from mi_ring.capture.capture import Capture
 from mi_ring.geometry.hull import MAX_WIDTH, shrink_mask
 from mi_ring.image_headers import bits_of
 from mi_ring.images import LOW_BITS, largest_value, read_image
+from mi_ring.metrics.brightness_samples import Sampler
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 from mi_ring.system.files import read_json
 
-CLIPPED, DARK, AMBIENT = 0.1, 0.5, 0.05  #: shares above which there is a finding
+CLIPPED, DARK = 0.1, 0.5  #: shares above which there is a finding
 ODD_POWER = 3.0  #: a light is odd if its fitted power is larger than this, or smaller than the inverse
 FAR, LEAST_FAR = 4.0, 2.0  #: a camera has moved far: more than this multiple of the median, and than this [px]
 
@@ -87,12 +87,12 @@ agreement: share of the mask that the other masks agree with"""
 
 
 def measure(
-    capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float]
+    capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float], sampler: Sampler | None = None
 ) -> list[PhotographQuality]:
     """Measure the quality of each photograph. Reads all photographs. Returns one row for each.
 
     `center` (3,), `radius`: normalising sphere [scene units]. `agreement`: a dict from the name of a mask file to the
-    share of this mask that the other masks confirm.
+    share of this mask that the other masks confirm. `sampler` collects samples of each photograph; None: no samples.
     """
     lights, rows = capture.photographs.lights, []
     lit = np.any(lights.rgb() > 0, axis=1)
@@ -101,7 +101,10 @@ def measure(
     for k, (shot, name, to_light, away, received) in enumerate(of_each):
         to_camera = shot.camera.position - center
         cosine = to_camera @ to_light / (np.linalg.norm(to_camera) * max(np.linalg.norm(to_light), 1e-12))
-        rgb, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k], -(-max(shot.size) // MAX_WIDTH))[:4])
+        scale = -(-max(shot.size) // MAX_WIDTH)
+        rgb, saturated, mask, masked = (t[0].numpy() for t in capture.observe([k], scale)[:4])
+        if sampler is not None:
+            sampler.add(k, scale, rgb, np.any(saturated, -1), mask)
         image, part = rgb.max(-1), shot.window.share if shot.window else 1.0
         inside = mask > 0.5 if masked else image > 0.02 * image.max()
         outside = ~ndimage.binary_dilation(inside, iterations=3) if masked else None
@@ -164,22 +167,6 @@ def facing(capture: Capture, center: np.ndarray) -> str | None:
     return f"{', '.join(np.array(capture.names)[away][:5])}: looking away from the object" if away.any() else None
 
 
-def room_light(brightness: np.ndarray, received: np.ndarray) -> float:
-    """Estimate the share of the light on the object that comes from the room, 0 to 1. It is a lower bound.
-
-    `received` (n,): irradiance at the object by the known lights, in each photograph. `brightness` (n,): brightness of
-    the object in each photograph, divided by `received`. Room light does not depend on the distance of the flash. So if
-    there is room light, the object looks too bright where `received` is small. So does it if the camera's curve is
-    flatter than assumed.
-    """
-    if len(received) < 12 or received.max() < 1.5 * received.min():
-        return 0.0
-    level = brightness * received
-    _, _, _, steepest = scipy.stats.theilslopes(level, received)
-    rest = np.median(level - steepest * received)
-    return float(max(0.0, rest / np.median(level)))
-
-
 def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np.ndarray) -> list[str]:
     """List the problems of a capture, each as a sentence for the user. Reads calibration.json if a fit has written it.
 
@@ -200,7 +187,6 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     if odd:
         found.append(f"{odd}: strength of the light, relative to the others, as the fit found it: did the flash fire?")
     found += filter(None, [units(capture, center)])
-    received = received_by(capture, center)
     # Only photographs with lights of their own, not from behind: others may show the unlit side.
     lit = [row for row in rows if row.angle is not None and row.angle < 60 and row.brightness > 0]
     typical = np.median([row.brightness for row in lit]) if lit else 1.0
@@ -221,12 +207,6 @@ def capture_findings(capture: Capture, rows: list[PhotographQuality], center: np
     if not any(capture.masks.given) and dark_threshold(capture) is None:
         found.append("no masks, and the background is not dark, which a fit without masks needs: give masks, or "
                      "find them with mi-ring photos")  # fmt: skip
-    exposed = [row in lit and row.clipped < CLIPPED for row in rows]  # the brightness of the others is not known
-    share = room_light(np.array([row.brightness for row in rows])[exposed], received[exposed])
-    if share > AMBIENT:
-        found.append(f"the object is hardly darker if the flash is farther away: as if {share:.0%} of the light came "
-                     "from the room, or the camera's curve were flatter; a fit finds the room's light and the camera's "
-                     "contrast itself")  # fmt: skip
     if (views := len({shot.camera.to_world.tobytes() for shot in capture.shots})) < 8:
         found.append(f"{views} views are too few: a closed surface needs about 30 from all sides")
     return found
