@@ -73,9 +73,10 @@ def errors(folder: Path, out: Path, curve: ToneCurve) -> dict[str, tuple[np.ndar
     center, _ = true.sphere()
     rig, exact = (Rig(capture, center, true.exposure()) for capture in (given, true))
     unknowns = found["unknowns"]
-    beside = exact.upright.numpy()[:2]
-    result = {"flash, % of the distance": [100 / rig.distance * part for part in (
-        np.array(unknowns["light"]["after"][:2]) - beside, np.array(unknowns["light"]["std"][:2]))]}  # fmt: skip
+    place = exact.upright.numpy()
+    light, std = (100 / rig.distance * np.array(unknowns["light"][name]) for name in ("after", "std"))
+    error = light - 100 / rig.distance * place
+    result = {"flash, % of the distance": [error[:2], std[:2]], "flash ahead": [error[2:], std[2:]]}
     strengths = [np.array([shot.own_light.rgb for shot in capture.shots]) for capture in (true, given)]
     power = np.log(strengths[0] / strengths[1])
     power -= power.mean(0)

@@ -414,21 +414,20 @@ def test_a_flash_is_one_though_some_photographs_were_held_on_their_side(small_ca
         np.testing.assert_allclose(calibration.rig.upright, FLASH, atol=1e-3)
 
 
-def test_a_flash_that_is_found_by_default_stays_beside_the_lens(small_capture):
+def test_gradients_move_a_flash_beside_the_lens_alone_by_default(small_capture):
     """How far ahead it is photographs hardly tell from how dark the surface is; `light` by name asks for that, too."""
     capture = mi_ring.load_capture(small_capture)
     by_default = Fit(capture, Config(domain="sphere")).model.calibration
-    moves = []
-    for calibration in (by_default, unknowns_of(capture, ("light",))):
+    for calibration, free in ((by_default, [True, True, False]), (unknowns_of(capture, ("light",)), [True] * 3)):
         before = calibration().places
         with torch.no_grad():
             calibration.light[0] = tensor([0.5, -0.3, 0.2])
         cameras = calibration.rig.views.cameras[:, :, :3]
-        moves.append(torch.einsum("pij,pi->pj", cameras, calibration().places - before) / calibration.rig.distance)
-    beside = tensor([0.5, -0.3, 0.2]) * UNKNOWNS["light"].width
-    torch.testing.assert_close(moves[1], beside.expand(len(capture), 3), rtol=1e-4, atol=1e-5)
-    beside[2] = 0
-    torch.testing.assert_close(moves[0], beside.expand(len(capture), 3), rtol=1e-4, atol=1e-5)
+        moves = torch.einsum("pij,pi->pj", cameras, calibration().places - before) / calibration.rig.distance
+        expected = tensor([0.5, -0.3, 0.2]) * UNKNOWNS["light"].width
+        torch.testing.assert_close(moves, expected.expand(len(capture), 3), rtol=1e-4, atol=1e-5)
+        (calibration().places * tensor(np.arange(3 * len(capture)).reshape(-1, 3))).sum().backward()
+        assert (calibration.light.grad[0] != 0).tolist() == free
 
 
 def test_powers_of_the_photographs_that_are_fitted_have_the_mean_one(small_capture):

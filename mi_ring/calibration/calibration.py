@@ -68,6 +68,8 @@ class Calibration(nn.Module):
         self.widths = {name: unknown.width_for(rig) for name, unknown in self.unknowns.items()}
         for name, unknown in self.unknowns.items():
             self.register_parameter(name, nn.Parameter(torch.zeros(unknown.shape(rig))))
+        if "light" in self.unknowns:  # a flash farther ahead looks like a darker surface: gradients do not tell it
+            self.get_parameter("light").register_hook(lambda gradient: gradient * rig.free)
         given = capture.room
         room = torch.zeros(BASIS, 3) if given is None else rig.power * torch.from_numpy(given).float()
         alone = not capture.photographs.lit.all() and not shared_emitters(capture.scene)

@@ -52,7 +52,7 @@ class Rig:
 
         `center` (3,): centre of the object. `exposure`: mean radiance of the object. `fitted`: indices of the
         photographs that are fitted; default: all. `power`: initial factor of all lights. `guessed`: the places of the
-        lights are guesses, not measurements. `ahead`: the fit may also move a flash along the camera's axis. `lamps`:
+        lights are guesses, not measurements. `ahead`: gradients also move a flash along the camera's axis. `lamps`:
         the fit refines the scene's own lamps. `powers`: the fit refines the power of each photograph's light.
         """
         self.path, self.exposure, self.power, self.guessed = capture.path, exposure, power, guessed
@@ -92,7 +92,8 @@ class Rig:
         self.flash = in_camera if rigid else None
         if self.flash is not None and self.mixed:
             self.flash = torch.where(self.lit[:, None], in_camera, self.upright)
-        self.free = torch.tensor([1.0, 1.0, float(ahead or self.flash is None)])  #: components of the lights' offset
+        #: (3,) factors of the gradient of the lights' offset
+        self.free = torch.tensor([1.0, 1.0, float(ahead or self.flash is None)])
 
         focal = np.stack([shot.whole.camera.focal for shot in capture.shots])
         kinds = np.column_stack([focal.round(3), views.distortion.round(6)])
@@ -152,7 +153,7 @@ class Rig:
         Distortions are clipped to the range in which each ray has exactly one pixel.
         """
         now = estimate.views
-        offset = (self.free * estimate.offset).expand(self.count("light"), 3)[self.place]
+        offset = estimate.offset.expand(self.count("light"), 3)[self.place]
         if self.flash is not None:
             in_camera = self.flash[..., None] + self.held @ (offset * self.distance)[..., None]
             places = now.cameras[:, :, 3] + (now.cameras[:, :, :3] @ in_camera)[..., 0]

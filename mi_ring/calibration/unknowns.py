@@ -93,7 +93,7 @@ class Distortion(Unknown):
 class LightPlace(Unknown):
     """Offset of each light's position [median distance of cameras and object]; of a distant light's direction [rad]."""
 
-    doubt = 0.002
+    doubt = (0.002, 0.002, 0.01)
 
     def width_for(self, rig: Rig) -> float:
         return self.width * (VAGUE if rig.guessed else 1.0)
@@ -104,9 +104,9 @@ class LightPlace(Unknown):
     def describe(self, value: np.ndarray, std: np.ndarray, found: Found) -> tuple[str, Any, Any, Any]:
         rig = found.rig
         if rig.flash is not None:
-            before, unit = rig.upright.numpy(), rig.distance * rig.free.numpy()
+            before = rig.upright.numpy()
             what = "place of the flash in the cameras' axes: to the left, up, ahead [scene units]"
-            return what, before, before + unit * value[0], unit * std[0]
+            return what, before, before + rig.distance * value[0], rig.distance * std[0]
         first = rig.mainly[np.unique(rig.place.numpy()[rig.mainly], return_index=True)[1]]
         places = (side.photographs.lights.positions()[first] for side in (found.before, found.after))
         units = np.where(rig.finite.numpy()[first], rig.distance, 1.0)

@@ -85,9 +85,8 @@ class JointEquations:
         result = {}
         for name, width in layout.calibration.widths.items():
             shape, doubt = getattr(layout.calibration, name).shape, layout.calibration.unknowns[name].doubt
-            # What is not told, such as how far the flash is ahead, is known as well as before.
-            told = np.hypot(width * spread[layout.places(name)], doubt)
-            result[name] = np.minimum(told, width).reshape(shape)
+            told = np.hypot(width * spread[layout.places(name)].reshape(shape), doubt)
+            result[name] = np.minimum(told, width)  # what is not told is known as well as before
         if layout.room:
             result["ambient"] = ROOM * exposure * spread[layout.places("ambient")][:3]
         return result

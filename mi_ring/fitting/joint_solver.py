@@ -63,7 +63,8 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
         first = np.linalg.solve(joint.matrix + np.diag(precision), right)[here[:3]]
         bright = max(float((given[0] + unit * first).mean()), FAINT * problem.exposure)
         precision[here[3:]] = (unit / (SIDES * bright)) ** 2
-        covariance = np.linalg.inv(joint.matrix + np.diag(precision))
+    covariance = np.linalg.inv(joint.matrix + np.diag(precision))
+    if layout.room:
         more, deviation = np.zeros_like(given), np.zeros_like(given)
         more[layout.room] = unit * (covariance @ right)[here].reshape(-1, 3)
         deviation[0] = unit * np.sqrt(np.diag(covariance)[here[:3]])
@@ -74,13 +75,30 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
     if names:  # beside the room that is believed, and all else as it is; moved toward as far as exposures differ
         own = np.concatenate([layout.places(name) for name in names])
         others = np.setdiff1d(np.arange(layout.count), own)
+        ahead = ahead_of_lens(layout, covariance, covariance @ right) if "light" in names else 0.0
         right = right - joint.matrix[:, others] @ solution[others]
         solution, width = with_learnt_width(layout, names, own, joint.matrix, right)
         share = max(0.0, 1 - (DOUBT_OF_EXPOSURES / width) ** 2) if width else 0.0
-        for name in names if share else ():
+        for name in names:
             before = calibration.get_parameter(name).detach().double().cpu()
-            result[name] = before + share * (torch.from_numpy(solution[layout.places(name)]).view_as(before) - before)
+            value = before + share * (torch.from_numpy(solution[layout.places(name)]).view_as(before) - before)
+            if name == "light" and not rig.free[2]:
+                value[:, 2] = ahead
+            if not torch.equal(value, before):
+                result[name] = value
     return result
+
+
+def ahead_of_lens(layout: Layout, covariance: np.ndarray, solution: np.ndarray) -> float:
+    """Return how far a flash is believed to be ahead of where the capture says, in the unit of `LightPlace`.
+
+    Brightness alone does not tell it, but how brightness changes with the distance. `covariance` (N, N), `solution`
+    (N,): of all unknowns together. The share that is believed is that of `believed`.
+    """
+    place = layout.places("light")[2]
+    doubt = np.ravel(layout.calibration.unknowns["light"].doubt)[2] / layout.calibration.widths["light"]
+    variance = covariance[place, place] + doubt**2
+    return float(solution[place] * max(0.0, 1 - variance / max(solution[place] ** 2, variance)))
 
 
 def with_learnt_width(
