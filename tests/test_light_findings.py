@@ -72,6 +72,14 @@ def test_a_room_in_photographs_of_free_exposures_is_named_too():
     assert text.startswith(NAMED) and any(f" {share}% " in text for share in (40, 50, 60))
 
 
+def test_a_room_without_a_flash_is_not_said_to_be_a_curve():
+    """The light of each photograph is then not what the scene file says."""
+    samples, reflected = sphere()
+    samples.brightness = np.where(np.isfinite(samples.brightness), reflected, np.nan)
+    (text,) = light_findings(samples)
+    assert text.startswith(FLAT) and "light of the room and a flatter curve" in text and "better" not in text
+
+
 @pytest.mark.parametrize("curve", [lambda b: 0.7 * b**0.7, lambda b: contrasted(b, 0.7)], ids=["power", "contrast"])
 def test_a_flat_curve_is_no_room_of_some_share(curve):
     samples, _ = sphere()

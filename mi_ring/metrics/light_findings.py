@@ -25,7 +25,8 @@ COSINES = np.array([0.2, 0.35, 0.5, 0.65, 0.8, 0.92, 1.0])  #: between which the
 #: Prior standard deviations of exponent of the cone, of two tilts, and of two offsets [radii]
 PLACE = np.array([20.0, 3.0, 3.0, 0.15, 0.15])
 LOWEST, HIGHEST = 0.004, 0.6  #: of predicted brightness; curves, noise and clipping change the rest
-LIMITS = {"room": (-0.15, 50.0), "power": (0.5, 2.0), "contrast": (0.5, 2.0)}  #: of what the alternatives add
+FLATTEST = 0.5  #: least exponent or contrast of a curve
+LIMITS = {"room": (-0.15, 50.0), "power": (FLATTEST, 2.0), "contrast": (FLATTEST, 2.0)}  #: of what the alternatives add
 NEUTRAL = {"room": 0.0, "power": 1.0, "contrast": 1.0}
 # Calibrated on captures with and without a room, and on those whose photographs were given curves and exposures.
 CLEARLY, BETTER = 3.0, 2.5  #: standard deviations that a finding, or the better of two alternatives, must have
@@ -208,7 +209,8 @@ def light_findings(samples: BrightnessSamples | None) -> list[str]:
     else:
         flat = 1 - best.value > LEAST_CURVE + 2 * best.deviation + CONE * abs(plain.cone)
     if flat and worse(plain) > CLEARLY:
-        if best is not room and worse(room) > BETTER:
+        # A curve as flat as can be stands for a room without a flash, too.
+        if best is not room and best.value > FLATTEST and worse(room) > BETTER:
             return ["shading is flatter than the flash explains: a flatter curve of the camera explains it better than "
                     "light of the room; a fit decides"]  # fmt: skip
         sure = room.value > LEAST_NAMED + 2 * room.deviation
