@@ -606,6 +606,17 @@ def test_calibration_survives_the_scene_file(small_capture, tmp_path):
     assert [s.files for s in read.shots] == [s.files for s in capture.shots]
 
 
+def test_a_light_without_a_colour_has_a_room_beside_it(small_capture):
+    """Of the missing colour the share is relative to the mean of the others."""
+    capture = mi_ring.load_capture(small_capture)
+    shots = tuple(replace(s, light=s.own_light._replace(rgb=np.array([4.0, 2.0, 0.0]))) for s in capture.shots)
+    calibration = unknowns_of(replace(capture, shots=shots), ("ambient",))
+    room = torch.zeros(BASIS, 3)
+    room[0] = 1.0
+    red, green, blue = calibration.room_share(room).tolist()
+    assert green == pytest.approx(2 * red) and blue == pytest.approx(green)
+
+
 def test_photographs_without_ids_keep_their_own_cameras(small_capture, tmp_path):
     scene = ElementTree.fromstring(small_capture.read_bytes())
     for sensor in scene.findall("sensor"):

@@ -15,7 +15,7 @@ from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.errors import InputError
 from mi_ring.geometry import hull
 from mi_ring.metrics import capture_findings, mask_agreement
-from mi_ring.metrics.brightness_samples import Sampler
+from mi_ring.metrics.brightness_samples import BrightnessSampler
 from mi_ring.output import inspection
 from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.system import command
@@ -278,16 +278,16 @@ def test_brightness_is_sampled_with_the_light_that_points_get(small_capture):
     """Points of a matt object reflect one share of their irradiance, but where the hull is not the object."""
     capture = load_capture(small_capture)
     center, radius = capture.sphere()
-    sampler = Sampler.of(capture, center, radius)
+    sampler = BrightnessSampler.of(capture, center, radius)
     capture_findings.measure(capture, center, radius, {}, sampler)
-    samples = sampler.samples()
+    samples = sampler.samples(center)
     shown = np.isfinite(samples.brightness) & (samples.cosine > 0.5)
     with np.errstate(invalid="ignore"):
         reflected = np.where(shown, np.log(samples.brightness / samples.irradiance / samples.cosine), np.nan)
     often = shown.sum(0) >= 3
     assert len(samples.falloff) == len(capture) and shown.sum(1).min() >= 50 and often.sum() > 100
     assert np.median(np.nanstd(reflected[:, often], 0)) < 0.1 < 0.2 < np.nanstd(np.log(samples.brightness[shown]))
-    assert not Sampler.of(replace(capture, room=np.ones((BASIS, 3))), center, radius).chosen  # a room is known
+    assert not BrightnessSampler.of(replace(capture, room=np.ones((BASIS, 3))), center, radius)  # a room is known
 
 
 def test_what_brightness_tells_is_a_finding(small_capture, tmp_path, capsys, monkeypatch):

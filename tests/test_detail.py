@@ -63,6 +63,7 @@ def test_gloss_changes_a_third_as_much_as_colour():
         values.data.fill_(0.2)
     expected = torch.tensor([0.6, 0.6, 0.6, 0.2, 0.2]).expand(len(s), 5)  # three octaves
     torch.testing.assert_close(detailed.evaluate(s) - before, expected, atol=1e-4, rtol=0)
+    torch.testing.assert_close(detailed.evaluate(s[:6].reshape(2, 3, 3)).reshape(6, 5), detailed.evaluate(s[:6]))
 
 
 def test_many_points_are_evaluated_in_parts(monkeypatch):
@@ -161,6 +162,17 @@ def test_displacement_is_along_the_normal_in_cells():
     assert ((moved.numpy() * normals).sum(1) / moved.norm(dim=1).numpy()).min() > 0.97
     half = (ring.surface(s, 0.5) - ring.to_scene(ring.shape_net.base.network(s, 0.5))) / ring.radius
     assert torch.allclose(half, moved / 2, atol=1e-5)
+
+
+def test_sides_that_cancel_are_not_displaced():
+    """Of a wall that is thinner than the cubes. Beside it one side alone has a direction."""
+    random, above = np.random.default_rng(5), np.array([0, 0, 0.01])
+    wall = np.column_stack([random.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
+    points = torch.from_numpy(np.concatenate([wall + above, wall - above, [[3.0, 3.0, 3.0]]])).float()
+    normals = torch.tensor([[0.0, 0, 1]] * 4000 + [[0.0, 0, -1]] * 4000 + [[0.0, 1, 0]])
+    detailed = DetailedFlow.of(small().shape_net, Grid.around(points, 0.5, 1, 1), points, normals)
+    lengths = detailed.directions0.norm(dim=1)
+    assert set(lengths.round(decimals=3).tolist()) == {0.0, 1.0} and (lengths > 0.5).sum() <= 8
 
 
 def test_material_stays_in_its_range():

@@ -249,6 +249,14 @@ def test_it_is_in_the_file_and_edits_reach_it(sharp):
     np.testing.assert_allclose(halved, np.tile([0.5, 1, 1], (500, 1)), atol=0.02)
 
 
+def test_high_photographs_are_as_large_as_wide_ones():
+    """A reduced one is at most 1.5 times as high as the width says."""
+    shots = [SimpleNamespace(window=None, size=size) for size in ((600, 2400), (700, 500))]
+    assert fine_texture.texture_width(SimpleNamespace(shots=shots), [0, 1]) == 1600
+    assert fine_texture.texture_width(SimpleNamespace(shots=shots), [1]) == 700
+    assert fine_texture.texture_width(SimpleNamespace(shots=shots), []) == 0
+
+
 def test_nothing_changes_without_photographs(print_scene):
     ring, capture = pale_ball(), load_capture(print_scene, width=40)
     assert sharpened(capture, ring, 40, []) is ring

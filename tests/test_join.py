@@ -105,8 +105,8 @@ def test_what_a_photograph_says_is_kept(two):
     room = ('<string name="valid" value="masks/002.png"/> <float name="distortion" value="-0.2"/> '
             '<float name="falloff" value="2"/> <string name="tilt" value="1 2"/> ')  # fmt: skip
     for path in (two.flash, two.room):
-        for file in (path.parent / "images/001.png",):
-            mi.Bitmap(257 * read_image(file).astype(np.uint16)).write(str(file))
+        file = path.parent / "images/001.png"
+        mi.Bitmap(257 * read_image(file).astype(np.uint16)).write(str(file))
     two.edit(two.flash, (r'(id="001">)', rf"\1{says}"), (r'(id="003">)', r'\1<string name="ambient" value="a.png"/>'))
     two.edit(two.room, (r'(id="001">)', rf"\1{room}{says}"))
     shutil.copy(two.flash.parent / "images/003.png", two.flash.parent / "a.png")

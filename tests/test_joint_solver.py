@@ -109,6 +109,28 @@ def test_how_far_the_flash_is_ahead_is_believed_as_far_as_it_is_told(small_captu
         np.testing.assert_allclose(found["light"], [[0, 0, share * truth]], atol=1e-6)
 
 
+def test_powers_are_those_beside_the_distance_that_is_believed(small_capture, monkeypatch):
+    """Where the flash's distance and the powers look alike, and a small distance is not believed."""
+    fit = fit_of(small_capture, refine=("light", "power"))
+    fit.model.calibration.rig.free[2] = 0.0  # as by default
+    layout, random = Layout(fit.model.calibration), np.random.default_rng(7)
+    slopes = random.normal(size=(3 * layout.count, layout.count))
+    power, ahead = layout.places("power"), layout.places("light")[2]
+    slopes[:, ahead] += slopes[:, power] @ random.normal(size=len(power))
+    truth = 2 * layout.centring() @ random.normal(size=layout.count)
+    truth[ahead] = 0.05
+    matrix = 1e4 * slopes.T @ slopes
+    monkeypatch.setattr(JointEquations, "of", lambda *_: JointEquations(layout, matrix, matrix @ truth))
+    found = solve_jointly(fit.problem, fit.model, fit.renderer, 2)
+    own = np.setdiff1d(np.arange(layout.count), [ahead])
+    expected = np.zeros(layout.count)
+    expected[own] = np.linalg.solve(matrix[np.ix_(own, own)], (matrix @ truth)[own])  # beside a distance of 0
+    expected = (layout.centring() @ expected)[power]
+    expected *= 1 - (0.4 / expected.std()) ** 2
+    assert found["light"][0, 2] == 0
+    np.testing.assert_allclose(found["power"].ravel(), expected, atol=1e-3)
+
+
 @pytest.mark.parametrize("spread", [0.3, 2.5])
 def test_the_width_of_the_powers_prior_is_that_of_the_largest_evidence(small_capture, spread):
     """By a search over the logarithm of the marginal likelihood, in units of the prior that is written down."""
@@ -118,7 +140,7 @@ def test_the_width_of_the_powers_prior_is_that_of_the_largest_evidence(small_cap
     truth = layout.centring() @ (spread * random.normal(size=count))
     matrix, right = slopes.T @ slopes, slopes.T @ (slopes @ truth + 2 * random.normal(size=len(slopes)))
     matrix, right = matrix / 4, right / 4
-    found, width = with_learnt_width(layout, ["power"], np.arange(count), matrix, right)
+    found, width = with_learnt_width(layout, "power", np.arange(count), matrix, right)
 
     def evidence(width):
         system = matrix + np.eye(count) / width**2

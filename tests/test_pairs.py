@@ -32,7 +32,7 @@ from mi_ring.rendering.image_formation import render_photographs
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.scene.lights import Light
-from mi_ring.scene.shot import Files, Shot
+from mi_ring.scene.shot import Files, Shot, Window
 from mi_ring.system.machine import threads_of
 
 VIEWS = 10
@@ -103,6 +103,29 @@ def test_an_ambient_image_becomes_a_photograph(pairs):
     assert [shot.name for shot in with_room_photographs(some).shots] == ["000", "001", "000_room"]
     with pytest.raises(InputError, match="pairs: is twice, must be one of subtract, both"):
         mi_ring.load_capture(pairs, pairs="twice")
+
+
+def test_crops_of_other_sizes_are_of_one_camera(pairs):
+    both = mi_ring.load_capture(pairs, pairs="both")
+    lens = [replace(s, camera=s.camera._replace(centre=np.array([20.123456789, 16.3]))) for s in both.shots]
+    first, *others = (Window((w % 5, 1), (w, 29), (w // 3, 10), lens[0].size) for w in range(15, 35))
+    key = lens[0].through(first).whole.camera.key
+    other = next(window for window in others if lens[0].through(window).whole.camera.key != key)
+    shots = [shot.through(first if k < VIEWS else other) for k, shot in enumerate(lens)]
+    assert camera_numbers(replace(both, shots=tuple(shots))).tolist() == [*range(VIEWS)] * 2
+
+
+def test_photographs_that_tell_nothing_are_left_out_of_the_joint_equations(pairs):
+    """Those of the room alone, if the room is known."""
+    capture = replace(mi_ring.load_capture(pairs, pairs="both"), room=np.ones((BASIS, 3)))
+    fit = mi_ring.Fit(capture, mi_ring.Config(refine=("power",), domain="sphere", indirect=False))
+    joint = JointEquations.of(fit.problem, fit.model, fit.renderer, 2)
+    assert joint.matrix.any() and fit.model.calibration.exposure_of_flash is None
+    light = mi_ring.Fit(capture, mi_ring.Config(refine=("light", "power"), domain="sphere", indirect=False))
+    light.model.calibration.rig.free[2] = 0.0  # as by default
+    found = JointEquations.of(light.problem, light.model, light.renderer, 2).deviations(light.problem.exposure)
+    assert light.model.calibration.rig.flash is not None
+    assert found["light"][0, 2] == light.model.calibration.widths["light"] > 3 * found["light"][0, :2].max()
 
 
 def test_what_is_open_of_pairs_and_of_others(pairs):

@@ -49,6 +49,13 @@ def test_what_is_switched_off_changes_nothing_else_that_is_drawn(changes, usual,
         assert torch.equal(one.points, another.points) == changes.get("resample", True)
 
 
+def test_details_see_other_photographs_in_each_iteration():
+    """A quarter of those of a size at most, but one; where memory asks for fewer, these."""
+    capture = SimpleNamespace(shots=[SimpleNamespace(size=(8, 8))] * 12, sizes={(8, 8): np.arange(12)})
+    sampler = Sampler(SimpleNamespace(capture=capture, fitted=np.arange(12), config=Config(seed=5)))
+    assert [len(sampler.draw_photographs(8, most)[0]) for most in (None, 8, 2, 0)] == [8, 3, 2, 1]
+
+
 def test_each_photograph_comes_before_one_comes_again():
     sizes = {(40, 56): np.arange(5), (56, 40): np.arange(5, 12)}
     shots = [SimpleNamespace(size=size) for size, index in sizes.items() for _ in index]

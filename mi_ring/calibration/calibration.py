@@ -68,8 +68,12 @@ class Calibration(nn.Module):
         self.widths = {name: unknown.width_for(rig) for name, unknown in self.unknowns.items()}
         for name, unknown in self.unknowns.items():
             self.register_parameter(name, nn.Parameter(torch.zeros(unknown.shape(rig))))
-        if "light" in self.unknowns:  # a flash farther ahead looks like a darker surface: gradients do not tell it
+        if (
+            "light" in self.unknowns
+        ):  # a flash farther ahead looks like a darker surface: by default no gradient moves it
             self.get_parameter("light").register_hook(lambda gradient: gradient * rig.free)
+        #: Is one flash that moves with the cameras the only light that scene and photographs state?
+        self.flash_alone = rig.flash is not None and bool(rig.lit.all()) and not shared_emitters(capture.scene)
         given = capture.room
         room = torch.zeros(BASIS, 3) if given is None else rig.power * torch.from_numpy(given).float()
         alone = not capture.photographs.lit.all() and not shared_emitters(capture.scene)
@@ -111,6 +115,12 @@ class Calibration(nn.Module):
             return []
         now = self.lamps()
         return [now.places.to(device()), now.strengths.to(device())]
+
+    @property
+    def exposure_of_flash(self) -> str | None:
+        """The unknown that the joint solution finds together with the flash's place: "power", "gain" or None."""
+        refined = [name for name in ("power", "gain") if name in self.unknowns]
+        return refined[0] if refined and self.flash_alone else None
 
     @property
     def follows_room(self) -> bool:

@@ -51,9 +51,9 @@ class Unknown(ABC):
     #: What it changes in a picture. view: how things are seen and lit; recording: only how that is recorded; light: the
     #: photograph's own light by a factor of each colour; gain: the same of all that is recorded; indirect: only that.
     changes: ClassVar[Literal["view", "recording", "light", "gain", "indirect"]] = "view"
-    #: Standard deviation, in the unknown's own unit, or of each component, that photographs cannot reduce: another
-    #: reflectance than those of the model looks like such a change. Measured by `benchmarks/coverage.py`.
-    doubt: ClassVar[float | tuple[float, ...]] = 0.0
+    #: Standard deviation, in the unknown's own unit, that photographs cannot reduce: another reflectance than those of
+    #: the model looks like such a change. Measured by `benchmarks/coverage.py`.
+    doubt: ClassVar[float] = 0.0
     solved: ClassVar[bool] = False  #: Has it a solver in `fitting`? Others follow their gradient by Adam.
 
     def shape(self, rig: Rig) -> tuple[int, ...]:
@@ -67,6 +67,10 @@ class Unknown(ABC):
     def width_for(self, rig: Rig) -> float:
         """Return the standard deviation of the prior for this rig, in the unknown's own unit."""
         return self.width
+
+    def doubt_for(self, rig: Rig) -> float | np.ndarray:
+        """Return the `doubt` for this rig: one number, or one for each component."""
+        return self.doubt
 
     def rows(self, rig: Rig, index: np.ndarray) -> list[np.ndarray]:
         """Find the rows of the parameter that affect the photographs `index` (n,).

@@ -22,6 +22,7 @@ from mi_ring.calibration.rig import Estimate, Rig
 from mi_ring.calibration.unknown import Found, Unknown
 from mi_ring.geometry.rotations import rotations
 
+DOUBT_AHEAD = 0.01  #: doubt of how far a flash is ahead of the lens [median distance of cameras and object]
 VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measured
 
 
@@ -93,10 +94,13 @@ class Distortion(Unknown):
 class LightPlace(Unknown):
     """Offset of each light's position [median distance of cameras and object]; of a distant light's direction [rad]."""
 
-    doubt = (0.002, 0.002, 0.01)
+    doubt = 0.002
 
     def width_for(self, rig: Rig) -> float:
         return self.width * (VAGUE if rig.guessed else 1.0)
+
+    def doubt_for(self, rig: Rig) -> float | np.ndarray:
+        return self.doubt if rig.flash is None else np.array([self.doubt, self.doubt, DOUBT_AHEAD])
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return replace(now, offset=value)
@@ -260,6 +264,9 @@ class Scale(Unknown):
 
 class LampPlace(LightPlace):
     """Offset of each lamp's position [median distance of cameras and object]; of a distant lamp's direction [rad]."""
+
+    def doubt_for(self, rig: Rig) -> float | np.ndarray:
+        return self.doubt
 
     def apply(self, now: Estimate, value: Tensor, rig: Rig) -> Estimate:
         return replace(now, lamp_offset=value)

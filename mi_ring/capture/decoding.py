@@ -35,8 +35,10 @@ class LinearImage(NamedTuple):
 
         This is approximate at edges, because pixels were averaged under the other curve.
         """
-        linear = self.rgb.astype(np.float32)
-        return linear if curve == self.curve else curve.removed(self.curve.applied(linear)).astype(np.float32)
+        linear, own = self.rgb.astype(np.float32), self.curve
+        if curve[1:] == own[1:]:  # the same S
+            curve, own = (ToneCurve(one.gamma) for one in (curve, own))
+        return linear if curve == own else curve.removed(own.applied(linear)).astype(np.float32)
 
 
 def decode(

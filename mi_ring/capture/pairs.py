@@ -66,8 +66,8 @@ def real(file: Path | None) -> str:
 def camera_numbers(capture: Capture) -> np.ndarray:
     """Number the cameras of a capture. Returns (P,) int, the number of each photograph's camera.
 
-    In a capture with both kinds of photographs, those whose cameras are equal have the same number. Differences from
-    rounding do not count. In all other captures each photograph has a number of its own.
+    In a capture with both kinds of photographs, those whose cameras are equal have the same number. Differences of the
+    lens by rounding do not count. In all other captures each photograph has a number of its own.
     """
     if not capture.photographs.mixed:
         return np.arange(len(capture))

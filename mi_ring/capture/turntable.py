@@ -27,7 +27,7 @@ def on_rings(poses: np.ndarray) -> bool | None:
     Then they are on rings about this axis, and each ring is one camera that is turned about it. Every ring has a camera
     of its own, which may have been moved before the next turn. `poses` (P, 4, 4) or (P, 3, 4): camera to world.
 
-    Returns None if all cameras look the same way from one place: then nothing turned.
+    Returns None if all cameras look the same way from one place, which tells nothing.
     """
     turns, places = poses[:, :3, :3], poses[:, :3, 3]
     axis = axis_of(turns)

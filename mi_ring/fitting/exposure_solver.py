@@ -54,6 +54,11 @@ class ExposureSolver(torch.optim.Optimizer):
         """(sizes, 5, 3): log of how much brighter photographs of each size are than predicted; 0: unknown."""
         return self.state[self.tensor]["brighter"]
 
+    def forget(self) -> None:
+        """Forget what has been measured: after a jump of the unknowns it is that of another surface."""
+        for values in self.state[self.tensor].values():
+            values.zero_()
+
     @torch.no_grad()
     def look(self, it: Iteration) -> None:
         """Measure the exposure of each photograph of an iteration, and store it for `step`.

@@ -81,12 +81,14 @@ class JointEquations:
         "ambient": (3,), the deviations of the first harmonic's R, G, B [radiance]. `exposure`: that of the problem. The
         deviations include the `doubt` of unknowns.
         """
-        layout, spread = self.layout, np.sqrt(np.diag(self.covariance))
+        layout, rig, spread = self.layout, self.layout.calibration.rig, np.sqrt(np.diag(self.covariance))
         result = {}
         for name, width in layout.calibration.widths.items():
-            shape, doubt = getattr(layout.calibration, name).shape, layout.calibration.unknowns[name].doubt
+            shape, doubt = getattr(layout.calibration, name).shape, layout.calibration.unknowns[name].doubt_for(rig)
             told = np.hypot(width * spread[layout.places(name)].reshape(shape), doubt)
             result[name] = np.minimum(told, width)  # what is not told is known as well as before
+            if name == "light" and not (layout.calibration.exposure_of_flash or rig.free[2]):
+                result[name][:, 2] = width  # nothing finds how far the flash is ahead
         if layout.room:
             result["ambient"] = ROOM * exposure * spread[layout.places("ambient")][:3]
         return result
@@ -95,7 +97,7 @@ class JointEquations:
         """List the options of `--refine` of which photographs tell hardly more than the priors.
 
         Of each component of the option's unknowns at least `UNTOLD` of the prior's standard deviation is left. Unknowns
-        of single photographs are left out.
+        of single photographs and the room are left out.
         """
         spread, least = np.sqrt(np.diag(self.covariance)), dict[str, float]()
         for name, unknown in self.layout.calibration.unknowns.items():

@@ -5,8 +5,6 @@ the powers, the surface explains a part of them, where few photographs see it. S
 anything of either. The joint equations tell what explains all photographs together.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,10 +16,9 @@ from mi_ring.fitting.model import Model
 from mi_ring.fitting.normal_equations import Layout
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.renderer import Renderer
-from mi_ring.scene.lights import shared_emitters
 
 DOUBT = 0.03  #: share of the flash that a room seems to have where the true reflectance is not one of the model's
-SOLVED = "light", "power", "gain"  #: unknowns that are solved for beside the room
+SOLVED = "light", "power", "gain"  #: unknowns that may be solved for beside the room
 WIDTH = 64  #: of the compared pictures [px]
 MOST = 40  #: photographs that are compared for the room alone: more hardly tell more, and take longer
 #: Errors of cameras, masks and surface look like powers or gains that differ by so much (log, standard deviation).
@@ -43,9 +40,8 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
     assert calibration is not None
     room, rig = calibration.room, calibration.rig
     # With other lights the derivatives by a power would be those of all light.
-    alone = rig.flash is not None and rig.lit.all() and not shared_emitters(problem.capture.scene)
-    names = [name for name in SOLVED if name in calibration.unknowns and alone]
-    names = names if {"power", "gain"} & {*names} else []  # a flash alone is found by its gradient
+    exposure = calibration.exposure_of_flash
+    names = [name for name in ("light", exposure) if name in calibration.unknowns] if exposure else []
     if not (names or "ambient" in calibration.refined):
         return {}
     most = None if names else MOST
@@ -72,20 +68,24 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
         found[:, found[0] < 0] = 0  # a room with negative mean radiance is impossible
         result["ambient"] = torch.from_numpy(found)
         solution[here] = (found - given)[layout.room].ravel() / unit
-    if names:  # beside the room that is believed, and all else as it is; moved toward as far as exposures differ
+    if exposure:  # beside the room and the flash's distance that are believed, and all else as it is
         own = np.concatenate([layout.places(name) for name in names])
+        if "light" in names and not rig.free[2]:
+            place = layout.places("light")[2]
+            solution[place] = ahead_of_lens(layout, covariance, covariance @ right)
+            own = own[own != place]
         others = np.setdiff1d(np.arange(layout.count), own)
-        ahead = ahead_of_lens(layout, covariance, covariance @ right) if "light" in names else 0.0
-        right = right - joint.matrix[:, others] @ solution[others]
-        solution, width = with_learnt_width(layout, names, own, joint.matrix, right)
-        share = max(0.0, 1 - (DOUBT_OF_EXPOSURES / width) ** 2) if width else 0.0
+        system, right = (
+            joint.matrix[np.ix_(own, own)],
+            right[own] - joint.matrix[np.ix_(own, others)] @ solution[others],
+        )
+        solution[own], width = with_learnt_width(layout, exposure, own, system, right)
+        share = max(0.0, 1 - (DOUBT_OF_EXPOSURES / width) ** 2)  # the less exposures differ, the more all stay
+        solution[own] = current[own] + share * (solution[own] - current[own])
         for name in names:
-            before = calibration.get_parameter(name).detach().double().cpu()
-            value = before + share * (torch.from_numpy(solution[layout.places(name)]).view_as(before) - before)
-            if name == "light" and not rig.free[2]:
-                value[:, 2] = ahead
-            if not torch.equal(value, before):
-                result[name] = value
+            value = solution[layout.places(name)].reshape(calibration.get_parameter(name).shape)
+            if (value != current[layout.places(name)].reshape(value.shape)).any():
+                result[name] = torch.from_numpy(value)
     return result
 
 
@@ -95,32 +95,30 @@ def ahead_of_lens(layout: Layout, covariance: np.ndarray, solution: np.ndarray) 
     Brightness alone does not tell it, but how brightness changes with the distance. `covariance` (N, N), `solution`
     (N,): of all unknowns together. The share that is believed is that of `believed`.
     """
-    place = layout.places("light")[2]
-    doubt = np.ravel(layout.calibration.unknowns["light"].doubt)[2] / layout.calibration.widths["light"]
+    place, unknown = layout.places("light")[2], layout.calibration.unknowns["light"]
+    doubt = np.ravel(unknown.doubt_for(layout.calibration.rig))[2] / layout.calibration.widths["light"]
     variance = covariance[place, place] + doubt**2
     return float(solution[place] * max(0.0, 1 - variance / max(solution[place] ** 2, variance)))
 
 
 def with_learnt_width(
-    layout: Layout, names: Sequence[str], own: np.ndarray, matrix: np.ndarray, right: np.ndarray
+    layout: Layout, exposure: str, own: np.ndarray, matrix: np.ndarray, right: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Solve for the unknowns at the places `own`. The prior of powers or gains is as wide as these turn out to differ.
+    """Solve for n unknowns. The prior of the powers or gains is as wide as these turn out to differ.
 
-    `matrix` (N, N) and `right` (N,): normal equations, without priors, of all unknowns. `names`: those to solve for.
-    Returns (the solution (N,), 0 at other places; the standard deviation of powers or gains, 0 if there are none). The
-    width is that of the largest evidence, by expectation-maximisation ("Empirical Bayes", Carlin and Louis 2000).
+    `own` (n,): places of the unknowns in the vector of all. `exposure`: "power" or "gain", which is among them.
+    `matrix` (n, n), `right` (n,): their normal equations without priors. Returns (the solution (n,), the standard
+    deviation of the powers or gains). The width is that of the largest evidence, by expectation-maximisation
+    ("Empirical Bayes", Carlin and Louis 2000).
     """
-    result, precision, width = np.zeros(layout.count), np.ones(layout.count), 0.0
-    centring = layout.centring()
+    precision, mine = np.ones(len(own)), np.isin(own, layout.places(exposure))
+    centring, width = layout.centring()[np.ix_(own, own)], 0.0
+    result = np.zeros(len(own))
     for _ in range(ROUNDS):
-        covariance = np.linalg.inv(matrix[np.ix_(own, own)] + np.diag(precision[own]))
-        result[own] = covariance @ right[own]
-        result = centring @ result
-        for name in {"power", "gain"} & {*names}:
-            here = layout.places(name)
-            squares = result[here] ** 2 + np.diag(covariance)[np.isin(own, here)]
-            precision[here] = 1 / squares.mean()
-            width = layout.calibration.widths[name] * float(squares.mean()) ** 0.5
+        covariance = np.linalg.inv(matrix + np.diag(precision))
+        result = centring @ covariance @ right
+        variance = float((result[mine] ** 2 + np.diag(covariance)[mine]).mean())
+        precision[mine], width = 1 / variance, layout.calibration.widths[exposure] * variance**0.5
     return result, width
 
 

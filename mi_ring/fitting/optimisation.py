@@ -212,7 +212,7 @@ class Optimisation:
                 tensor.data.copy_(value)
                 for optimizer in self.optimizers:
                     if isinstance(optimizer, ExposureSolver) and optimizer.tensor is tensor:
-                        optimizer.measured.zero_()  # it was measured beside another surface
+                        optimizer.forget()
                     else:
                         optimizer.state.pop(tensor, None)  # it leads away from another value
         elif schedule.lights_due(iteration) and finds_small_lights(calibration, problem.config):

@@ -19,7 +19,7 @@ from mi_ring.scene.lights import shared_emitters
 
 #: What `--refine auto` stands for. With enough photographs, `cameras` are added, `falloff` for a flash that moves with
 #: the camera and has no known cone, and `contrast` for sRGB files of an unknown camera. `scale` is added where the
-#: lights' intensities cannot be true. Of a flash, the place beside the lens is refined: a flash farther ahead looks
+#: lights' intensities cannot be true. Gradients move a flash only beside the lens: one farther ahead looks
 #: like a darker surface. Not `curve`: it looks like another reflectance, too.
 AUTO = "light", "power", "ambient"
 #: What is refined under each kind of unknown light.

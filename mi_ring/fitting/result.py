@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from mi_ring.capture.capture import Capture
+from mi_ring.errors import InputError
 from mi_ring.fitting.course import Course
 from mi_ring.fitting.fine_texture import sharpened
 from mi_ring.fitting.joint_equations import JointEquations
@@ -58,7 +59,9 @@ def result_of(
         except Exception as error:  # a file has gone, memory is full; all else can be saved
             if interrupted():
                 raise
-            print(f"There is no texture: {error or type(error).__name__}")
+            release_memory()
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            print(f"There is no texture: {kind}{error}")
     return FitResult(
         ring=ring,
         surface=renderer.show(model, ring.subdivisions),

@@ -12,7 +12,7 @@ from scipy import ndimage
 from mi_ring.capture.capture import Capture
 from mi_ring.errors import InputError
 from mi_ring.geometry.hull import evenly_spaced
-from mi_ring.scene.assembly import lamps_of
+from mi_ring.scene.lights import shared_emitters
 from mi_ring.scene.visibility import MaskedCamera, Visibility
 
 POINTS, MOST = 600, 40  #: number of points of the surface, and of photographs
@@ -42,47 +42,45 @@ class BrightnessSamples:
 
 
 @dataclass
-class Sampler:
+class BrightnessSampler:
     """Collects `BrightnessSamples`, one photograph after the other.
 
-    `center` (3,), `radius`: normalising sphere [scene units].
+    `points`, `normals` (M, 3): of the surface. `radius`: of the normalising sphere [scene units].
     """
 
     capture: Capture
-    center: np.ndarray
     radius: float
     chosen: list[int]  #: indices of the photographs to use
-    rows: list[tuple[np.ndarray, ...]] = field(default_factory=list)
+    points: np.ndarray
+    normals: np.ndarray
+    visibility: Visibility
+    rows: dict[int, np.ndarray] = field(default_factory=dict)  #: (9, M) by photograph
 
     @classmethod
-    def of(cls, capture: Capture, center: np.ndarray, radius: float) -> "Sampler":
-        """Choose the photographs to use. There are none where brightness has other causes than a flash and the room.
+    def of(cls, capture: Capture, center: np.ndarray, radius: float) -> "BrightnessSampler | None":
+        """Choose the photographs and the points to use. Returns None where brightness has other known causes.
 
-        These are a room or lamps in the scene file, lights that are distant or far from the camera, and no hull.
+        These are an environment, a room or lamps in the scene file, and photographs of a room beside those with a
+        flash. It is also None for lights that are distant or far from the camera, and without a hull. `center` (3,):
+        of the normalising sphere [scene units].
         """
         photographs = capture.photographs
+        known = photographs.mixed or photographs.room_rows or shared_emitters(capture.scene, rooms=True)
+        if known or not (capture.hull and capture.whole):
+            return None
         toward = photographs.lights.toward(center)
         cameras = np.stack([shot.camera.position for shot in capture.shots]) - center
         lengths = np.linalg.norm(toward, axis=1) * np.linalg.norm(cameras, axis=1)
         near = (toward * cameras).sum(1) > np.cos(np.radians(BESIDE)) * lengths
         usable = np.flatnonzero(near & photographs.lit & photographs.in_room & photographs.lights.is_finite())
-        known = photographs.room_rows or lamps_of(capture.scene) or not (capture.hull and capture.whole)
-        chosen = [] if known else [int(usable[i]) for i in evenly_spaced(len(usable), MOST)]
-        sampler = cls(capture, center, radius, chosen)
-        if chosen:
-            try:
-                sampler.prepare()
-            except InputError:  # the hull is empty, which another finding says
-                sampler.chosen = []
-        return sampler
-
-    def prepare(self) -> None:
-        """Choose the points of the surface. Raises NoHull if the hull is empty."""
-        assert self.capture.hull
-        mesh = self.capture.hull.surface(RESOLUTION)
-        self.points, self.normals = surface_points(mesh, POINTS)
-        self.visibility = Visibility(mesh.vertices, mesh.faces, [])
-        self.lights = self.capture.photographs.lights
+        if not len(usable):
+            return None
+        try:
+            mesh = capture.hull.surface(RESOLUTION)
+        except InputError:  # the hull is empty, which another finding says
+            return None
+        chosen = [int(usable[i]) for i in evenly_spaced(len(usable), MOST)]
+        return cls(capture, radius, chosen, *surface_points(mesh, POINTS), Visibility(mesh.vertices, mesh.faces, []))
 
     def add(self, k: int, scale: int, rgb: np.ndarray, clipped: np.ndarray, mask: np.ndarray) -> None:
         """Take the samples of photograph `k`, if it is one to use.
@@ -91,7 +89,7 @@ class Sampler:
         """
         if k not in self.chosen:
             return
-        shot, light = self.capture.shots[k], self.lights[k]
+        shot, light = self.capture.shots[k], self.capture.photographs.lights[k]
         camera = shot.camera.shrunk(scale)
         side = 2 * max(1, round(np.sqrt((mask > 0.5).sum()) / WINDOWS)) + 1
         image = ndimage.uniform_filter(rgb.mean(-1), side)
@@ -112,14 +110,14 @@ class Sampler:
         values = np.full((9, POINTS), np.nan)
         values[:, seen] = [image[row, column], light.rgb.mean() / distance**2 * beam, cosine, over[row, column],
                            np.log(ahead), left, up, *offset.T]  # fmt: skip
-        self.rows.append((values, np.asarray(1 / np.sum((light.vector - self.center) ** 2))))
+        self.rows[k] = values
 
-    def samples(self) -> BrightnessSamples | None:
-        """Return the samples of all photographs; None if there are none."""
-        if not self.rows:
-            return None
-        values, falloff = (np.stack(part) for part in zip(*self.rows))
-        usual = np.median(self.capture.photographs.irradiance(self.center).mean(1)[self.chosen])
+    def samples(self, center: np.ndarray) -> BrightnessSamples:
+        """Return the samples of all photographs. `center` (3,): centre of the object [scene units]."""
+        used, values = [*self.rows], np.stack([*self.rows.values()])
+        photographs = self.capture.photographs
+        usual = np.median(photographs.irradiance(center).mean(1)[self.chosen])
+        falloff = 1 / photographs.lights.distances(center)[used] ** 2
         brightness, irradiance, cosine, clipped = (values[:, n] for n in range(4))
         over = (clipped > 0) | (brightness > CLIPPED)
         return BrightnessSamples(brightness, irradiance / usual, cosine, np.moveaxis(values[:, 4:], 1, -1), over,

@@ -13,7 +13,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.geometry.hull import MAX_WIDTH, shrink_mask
 from mi_ring.image_headers import bits_of
 from mi_ring.images import LOW_BITS, largest_value, read_image
-from mi_ring.metrics.brightness_samples import Sampler
+from mi_ring.metrics.brightness_samples import BrightnessSampler
 from mi_ring.metrics.mask_agreement import CONFORMS, half_pixel
 from mi_ring.system.files import read_json
 
@@ -87,7 +87,11 @@ agreement: share of the mask that the other masks agree with"""
 
 
 def measure(
-    capture: Capture, center: np.ndarray, radius: float, agreement: dict[str, float], sampler: Sampler | None = None
+    capture: Capture,
+    center: np.ndarray,
+    radius: float,
+    agreement: dict[str, float],
+    sampler: BrightnessSampler | None = None,
 ) -> list[PhotographQuality]:
     """Measure the quality of each photograph. Reads all photographs. Returns one row for each.
 

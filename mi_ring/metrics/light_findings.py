@@ -5,7 +5,7 @@ albedos and exposures are free, as are the shading, a function of the rough norm
 and offset of the flash. Alternatives add one number each:
 
 - a room: irradiance that is equal in all photographs; it lifts dark shading, the more the farther the flash is;
-- a curve: a power of the irradiance, or the S-curve of `Response.contrast`; it flattens all shading alike.
+- a curve: a power of the irradiance, or the S-curve of `ToneCurve`; it flattens all shading alike.
 
 Exposures that depend on the flash's distance are the third reason. Those errors that the samples of a photograph share
 are why photographs count, not samples: standard deviations come from leaving out each photograph, and one
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_ring.images import contrasted
 from mi_ring.metrics.brightness_samples import BrightnessSamples
 
 FEWEST, FEWEST_POINTS = 12, 10  #: photographs; points in a photograph
@@ -99,12 +100,9 @@ def without_albedo(values: np.ndarray, table: Table, weight: np.ndarray) -> np.n
 
 
 def contrast_slope(log_brightness: np.ndarray) -> np.ndarray:
-    """Return the derivative of log C(brightness) by the contrast at 1. C: the curve of `Response.contrast`."""
-    x = np.exp(log_brightness).clip(1e-3, 0.98)
-    dark = x <= 0.0031308
-    v = np.where(dark, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    back = np.where(dark, 1 / 12.92, 2.4 / 1.055 * ((v + 0.055) / 1.055) ** 1.4)
-    return v * (1 - v) * np.log(v / (1 - v)) * back / x
+    """Return the derivative of log C(brightness) by the contrast at 1. C: the S-curve of `ToneCurve`."""
+    x, step = np.exp(log_brightness).clip(1e-3, 0.98), 1e-3
+    return (np.log(contrasted(x, 1 + step)) - np.log(contrasted(x, 1 - step))) / (2 * step)
 
 
 def fit(table: Table, alternative: str | None = None, iterations: int = 14) -> Explanation:
@@ -186,12 +184,12 @@ def falloff_exponent(table: Table, plain: Explanation) -> tuple[float, float]:
     return 1 + float(slope), float(np.sqrt(rest @ rest / (table.count - 2) / square + (CONE * plain.cone) ** 2))
 
 
-def light_findings(samples: BrightnessSamples | None) -> list[str]:
+def light_findings(samples: BrightnessSamples) -> list[str]:
     """Say what the brightness of the photographs tells of room, curve and exposures: at most one sentence.
 
     It is an empty list if brightness follows the light that the scene file states, or if it does not tell.
     """
-    table = None if samples is None else Table.of(samples)
+    table = Table.of(samples)
     if table is None:
         return []
     plain = fit(table)
@@ -223,13 +221,11 @@ def light_findings(samples: BrightnessSamples | None) -> list[str]:
     exponent, deviation = falloff_exponent(table, plain)
     if 1 - exponent > max(LEAST_EXPOSURE, CLEARLY * deviation):
         middle = (1 + exponent) / 2
-        flat = (
-            power.value - CLEARLY * power.deviation < middle or contrast.value - CLEARLY * contrast.deviation < middle
-        )
+        bent = power.value - CLEARLY * power.deviation < middle
+        bent = bent or contrast.value - CLEARLY * contrast.deviation < middle
         lifted = (room.value + CLEARLY * room.deviation) > (1 - middle) / middle
-        also = ["a flatter curve of the camera"] * flat + ["light of the room"] * lifted
-        reasons = " and ".join(["exposures that follow the distance", *also]) if len(also) < 2 else (
-            f"exposures that follow the distance, {also[0]} and {also[1]}")  # fmt: skip
+        also = [*["a flatter curve of the camera"] * bent, *["light of the room"] * lifted]
+        reasons = " and ".join([", ".join(["exposures that follow the distance", *also[:-1]]), *also[-1:]])
         many = f"{reasons} explain it about equally well; a fit decides" if also else f"as by {reasons}"
         return [f"brightness falls too little with the flash's distance: {many}"]
     return []

@@ -294,4 +294,4 @@ class DetailedMaterial(MaterialNet):
         factors = [1.0 if p.channels == 3 else GLOSS for p in self.bsdf_parameters for _ in range(p.channels)]
         points = s.reshape(-1, 3)
         result = self.base(points).float() + self.grid(points) * torch.tensor(factors, device=s.device)
-        return result.reshape(*s.shape[:-1], -1)
+        return result.reshape(*s.shape[:-1], self.outputs)

@@ -11,7 +11,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.geometry.camera import sphere_of_cameras
 from mi_ring.geometry.hull import NoHull
 from mi_ring.images import encoded_picture
-from mi_ring.metrics.brightness_samples import Sampler
+from mi_ring.metrics.brightness_samples import BrightnessSampler
 from mi_ring.metrics.capture_findings import capture_findings, facing, measure, quality_table, without_empty_masks
 from mi_ring.metrics.light_findings import light_findings
 from mi_ring.metrics.mask_agreement import agreements
@@ -62,11 +62,11 @@ def inspected(capture: Capture, advance: Callable[[], object]) -> Inspection:
     advance()
     agreement, wrong = agreements(capture)
     advance()
-    sampler = Sampler.of(capture, center, radius)
+    sampler = BrightnessSampler.of(capture, center, radius)
     rows = measure(capture, center, radius, agreement, sampler)
     advance()
     found += wrong or filter(None, [facing(capture, center)])
-    found += capture_findings(capture, rows, center) + light_findings(sampler.samples())
+    found += capture_findings(capture, rows, center) + (light_findings(sampler.samples(center)) if sampler else [])
     page = capture_sheet(capture, rows, center, radius)
     advance()
     given = sum(capture.masks.given)

@@ -20,7 +20,7 @@ from mi_ring.rendering.surface import Surface
 from mi_ring.rendering.views import Views
 from mi_ring.scene.plain_mesh import POSITIONS
 
-TEXTURE_RAYS = 4  #: in a pixel
+TEXTURE_RAYS, MOST_RAYS = 4, 16  #: least and largest number in a pixel
 NO_AREA = 1e-6  #: twice a triangle's area / (longest side)² below which float32 gives no normal
 
 
@@ -125,7 +125,9 @@ def draw(
         with without_gloss(surface) as is_other:
             how = spp, seed, shadows, indirect, paths, occlusion
             matte = draw(surface, photographs, *how)[0] if is_other else rgb.cpu()
-        rgb = rgb.cpu() + matte * (texture_factors(surface, photographs, seed, max(spp, TEXTURE_RAYS)) - 1)
+        rgb = rgb.cpu() + matte * (
+            texture_factors(surface, photographs, seed, min(max(spp, TEXTURE_RAYS), MOST_RAYS)) - 1
+        )
     return rgb.cpu(), coverage.cpu()
 
 
