@@ -171,8 +171,10 @@ def test_sides_that_cancel_are_not_displaced():
     points = torch.from_numpy(np.concatenate([wall + above, wall - above, [[3.0, 3.0, 3.0]]])).float()
     normals = torch.tensor([[0.0, 0, 1]] * 4000 + [[0.0, 0, -1]] * 4000 + [[0.0, 1, 0]])
     detailed = DetailedFlow.of(small().shape_net, Grid.around(points, 0.5, 1, 1), points, normals)
-    lengths = detailed.directions0.norm(dim=1)
-    assert set(lengths.round(decimals=3).tolist()) == {0.0, 1.0} and (lengths > 0.5).sum() <= 8
+    before = detailed(points).detach()
+    detailed.grid.values[0].data.fill_(1.0)
+    moved = (detailed(points).detach() - before).norm(dim=1) / detailed.grid.cells[0]
+    assert moved[:-1].max() < 0.05 and moved[-1] > 0.5
 
 
 def test_material_stays_in_its_range():
