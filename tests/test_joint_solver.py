@@ -91,9 +91,9 @@ def test_all_else_is_found_beside_the_room_that_is_believed(small_capture, monke
     assert [*solve_jointly(fit.problem, fit.model, fit.renderer, 2)] == ["ambient"]
 
 
-@pytest.mark.parametrize("truth", [0.25, -0.14, 0.05])  # in the unit of the prior, a tenth of the distance
+@pytest.mark.parametrize("truth", [0.4, -0.25, 0.15])  # in the unit of the prior, a tenth of the distance
 def test_how_far_the_flash_is_ahead_is_believed_as_far_as_it_is_told(small_capture, monkeypatch, truth):
-    """By 1 − error² / offset²; the error has a doubt of 1 % of the distance. Powers that are equal stay so."""
+    """By 1 − error² / offset²; the error has a doubt of 2 % of the distance. Powers that are equal stay so."""
     fit = fit_of(small_capture, refine=("auto",))
     layout = Layout(fit.model.calibration)
     place, spread = layout.places("light")[2], 0.06
@@ -103,7 +103,7 @@ def test_how_far_the_flash_is_ahead_is_believed_as_far_as_it_is_told(small_captu
     right[place] = truth * spread**-2  # of which the prior leaves `truth`
     monkeypatch.setattr(JointEquations, "of", lambda *_: JointEquations(layout, matrix, right))
     found = solve_jointly(fit.problem, fit.model, fit.renderer, 2)
-    share = max(0, 1 - (spread**2 + 0.1**2) / truth**2)
+    share = max(0, 1 - (spread**2 + 0.2**2) / truth**2)
     assert "power" not in found and ("light" in found) == (share > 0)
     if share:
         np.testing.assert_allclose(found["light"], [[0, 0, share * truth]], atol=1e-6)

@@ -22,7 +22,7 @@ from mi_ring.calibration.rig import Estimate, Rig
 from mi_ring.calibration.unknown import Found, Unknown
 from mi_ring.geometry.rotations import rotations
 
-DOUBT_AHEAD = 0.01  #: doubt of how far a flash is ahead of the lens [median distance of cameras and object]
+DOUBT_AHEAD = 0.02  #: doubt of how far a flash is ahead of the lens [median distance of cameras and object]
 VAGUE = 3.0  #: factor of the priors' widths of lights whose places nobody measured
 
 
