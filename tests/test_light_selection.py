@@ -33,7 +33,7 @@ DECISIONS = [
     ("environment", {"environment": 0.1, "environment on one material": 0.11}, "environment on one material", 0.35),
     ("environment", {"environment": 0.1, "environment on one material": 0.13}, "environment", 0),
     ("turntable", {"turntable": 0.1, "turntable on one material": 0.13}, "turntable", 0),
-    ("auto", {"environment": 0.095, "1 lamp": 0.094, "turntable": 0.085, "capture": 0.1}, "capture", 0),
+    ("auto", {"environment": 0.095, "1 lamp": 0.094, "turntable": 0.092, "capture": 0.1}, "capture", 0),
     ("auto", {"environment": None, "turntable": 0.05, "capture": 0.1, "turntable on one material": 0.09},
      "turntable", 0),
     ("auto", {"environment": 0.08, "1 lamp": 0.085, "turntable": 0.085, "capture": 0.1, "2 lamps": 0.06,
@@ -115,14 +115,12 @@ def test_whether_the_object_turned_says_in_which_axes_light_is_fixed(
     assert str(trials.likeliest(turned)) == believed
 
 
-@pytest.mark.parametrize(("errors", "believed", "limit"), [
-    ({"turntable": 0.08, "capture": 0.1, "turntable on one material": 0.1}, "turntable", "turntable 0.9"),
+@pytest.mark.parametrize(("errors", "believed"), [
+    ({"turntable": 0.08, "capture": 0.1, "turntable on one material": 0.1}, "turntable"),
     ({"turntable": None, "capture": 0.1, "environment": 0.08, "1 lamp": 0.2, "2 lamps": 0.2, "3 lamps": 0.2,
-      "1 distant lamp": 0.2, "environment on one material": 0.1}, "environment", "turntable 0.8"),
+      "1 distant lamp": 0.2, "environment on one material": 0.1}, "environment"),
 ])  # fmt: skip
-def test_for_an_object_that_turned_a_turntable_is_tried_first(
-    errors, believed, limit, small_capture, monkeypatch, capsys
-):
+def test_for_an_object_that_turned_a_turntable_is_tried_first(errors, believed, small_capture, monkeypatch, capsys):
     def error(trials, lighting):
         value = errors[str(lighting)]
         trials.errors[lighting] = np.inf if value is None else value
@@ -137,7 +135,7 @@ def test_for_an_object_that_turned_a_turntable_is_tried_first(
     capture = mi_ring.load_capture(small_capture)
     assert str(mi_ring.choose_lighting(capture, mi_ring.Config.preset("fast", light="auto"))) == believed
     said = capsys.readouterr().out
-    assert "the object turned" in said and limit in said
+    assert "the object turned" in said and "at most 0.9 of their error" in said
 
 
 def test_a_flash_capture_is_found_to_be_one(small_capture):

@@ -31,9 +31,8 @@ LAST = 12  #: last iterations of a coarse fit whose mean error counts
 ALIKE = 1.1  #: ratio of the lights' strengths above which a message is printed
 #: Another light than the scene's is chosen only if its error is below this share of the error with the scene's lights.
 #: An environment fixed in the camera looks much like a flash. Under a true flash its error was 1.3 to 1.7 times that of
-#: the flash, in rooms with windows 0.65 times. If the background shows that the object turned, it has no
-#: rival that is fixed in the world, and the limit of an environment.
-BETTER = {"environment": 0.9, "turntable": 0.8, "lamps": 0.9}
+#: the flash, in rooms with windows 0.65 to 0.83 times.
+BETTER = 0.9
 MOST = 3  #: lamps
 APART = 30.0  #: between lamps, seen from the object [degrees], for them to be two
 FEWER = 1.1  #: the fewest lamps are chosen whose error is at most this factor of the least
@@ -83,15 +82,9 @@ def choose_lighting(capture: Capture, config: Config) -> Lighting:
     errors = ", ".join(f"{lighting} {error:.3g}" for lighting, error in trials.errors.items())
     rule = f"; of lamps the fewest are believed that leave at most {FEWER:g} times the least" * bool(found.lamps)
     if Lighting("capture") in trials.errors:
-        rule += ("; those of the scene are kept unless another leaves at most {environment:g} of their error, "
-                 "turntable {turntable:g}").format(**limits(turned))  # fmt: skip
+        rule += f"; those of the scene are kept unless another leaves at most {BETTER:g} of their error"
     print(f"Light: taken to be {found} (--light {found.kind}); errors that coarse fits leave: {errors}{rule}")
     return found
-
-
-def limits(turned: bool | None) -> dict[str, float]:
-    """Return `BETTER`, as it is for an object that turned, did not turn, or of which this is not known."""
-    return BETTER | ({"turntable": BETTER["environment"]} if turned else {})
 
 
 class CoarseFits:
@@ -156,8 +149,8 @@ class CoarseFits:
             if math.isfinite(self.error(likely[0])):  # the environment shows where lamps are
                 likely.insert(1, self.brightest(1))
         if not is_unlit(self.capture):
-            own, shares = Lighting("capture"), limits(turned)
-            likely = [one for one in likely if self.error(one) < shares[one.kind] * self.error(own)] or [own]
+            own = Lighting("capture")
+            likely = [one for one in likely if self.error(one) < BETTER * self.error(own)] or [own]
         return self.best(*likely)
 
     def lamps(self) -> Lighting:
