@@ -55,10 +55,9 @@ def test_from_photographs_with_cameras_to_a_capture(folder, tmp_path, capsys):
     out = tmp_path / "capture"
     photos.main([str(folder), str(out), "--flash-offset", "0.1", "-0.05", "0"])
     text = capsys.readouterr().out
-    assert (
-        f"Cameras: 20 of 20 photographs, as given by {folder / 'transforms.json'}" in text
-        and "No problems found" in text
-    )
+    assert f"Cameras: 20 of 20 photographs, as given by {folder / 'transforms.json'}" in text
+    # They are equally bright at all distances.
+    assert text.count("Problem: ") == text.count("Problem: brightness falls too little with the flash's distance") == 1
     capture = load_capture(out / "scene.xml")
     assert len(capture) == 20 and all(mask is not None for mask in capture.masks)
     center, radius = capture.sphere()
