@@ -32,7 +32,7 @@ from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.images import linear_to_srgb
-from mi_ring.scene.shot import STRAIGHT, ToneCurve
+from mi_ring.scene.tone_curve import STRAIGHT, ToneCurve
 
 MATERIALS = ["principled base_color=0.6,0.3,0.1 roughness=0.4", "principled base_color=0.2,0.4,0.5 roughness=0.7"]
 ROOM, LIGHT, POWER = 0.1, 3.0, 10.0  #: options of mi-ring synthesize

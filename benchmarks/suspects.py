@@ -27,8 +27,9 @@ from typing import NamedTuple
 from mi_ring.capture.emitter_elements import numbers
 from mi_ring.capture.scenefile import move_names
 from mi_ring.colour_profiles import srgb_to_linear
-from mi_ring.images import contrasted, linear_to_srgb
+from mi_ring.images import linear_to_srgb
 from mi_ring.plugins.matte_reflection import DARKER
+from mi_ring.scene.tone_curve import contrasted
 
 # isort: split
 import mitsuba as mi

@@ -5,7 +5,7 @@ import io
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -39,30 +39,11 @@ MAX_LABELS = 32  #: largest number of values in a mask of labels; more are a pic
 ROWS = 256  #: of a strip: large pictures are converted strip by strip, to save memory
 EXR_CHUNK = 256  #: rows of the largest chunk of an OpenEXR file; its reader allocates one for an image of one row, too
 
-Pictures = TypeVar("Pictures", np.ndarray, Tensor)
-
 
 def linear_to_srgb(v: np.ndarray) -> np.ndarray:
     """Clip linear values of any shape to [0, 1] and encode them as sRGB values in [0, 1]."""
     v = np.clip(v, 0, 1)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def contrasted(linear: Pictures, contrast: Any, toe: Any = 0.0) -> Pictures:
-    """Apply an S-curve, like the curve of film, to linear values of any shape. Values of at least 1 do not change.
-
-    In terms of the sRGB value v, the curve is vᶜ / (vᶜ + (eᵗ (1 − v))ᶜ), where c is `contrast`, a number above 0, and t
-    is `toe`. With a positive toe the dark end of the curve is longer. Contrast 1 and toe 0 change nothing. Contrast
-    1 / c and toe −c t undo the curve. Returns linear values.
-    """
-    where: Any = torch.where if isinstance(linear, Tensor) else np.where
-    x = linear.clip(1e-6, 1 - 1e-6)  # so that the powers have finite derivatives
-    v = where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    darker = toe.exp() if isinstance(toe, Tensor) else math.exp(toe)
-    a, b = v**contrast, (darker * (1 - v)) ** contrast
-    v = a / (a + b)
-    y = where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
-    return where(linear < 1, y * where(linear < x, linear / x, 1.0), linear)  # linear below 1e-6
 
 
 def to_bytes(encoded: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from mi_ring.fitting.brightness_solver import BrightnessSolver, flash_slope, lea
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.processes import ALONE
 from mi_ring.fitting.schedule import Stage
-from mi_ring.images import contrasted
+from mi_ring.scene.tone_curve import contrasted
 
 INDEX = np.arange(12)
 

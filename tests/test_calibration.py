@@ -34,7 +34,7 @@ from mi_ring.output.calibration_panel import held_out_text
 from mi_ring.rendering import prediction
 from mi_ring.rendering.spherical_harmonics import BASIS
 from mi_ring.rendering.views import Views
-from mi_ring.scene.shot import ToneCurve
+from mi_ring.scene.tone_curve import ToneCurve
 
 CENTER = np.array([400.0, -150.0, 90.0])  #: of the object of `small_capture`
 FLASH = np.array([15.0, 10.0, 0.0])  #: of its flash, in the cameras' axes

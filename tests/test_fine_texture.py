@@ -31,7 +31,8 @@ from mi_ring.output.exporting import resolution_of
 from mi_ring.rendering import prediction
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.lights import Light
-from mi_ring.scene.shot import Files, Response, Shot, ToneCurve
+from mi_ring.scene.shot import Files, Response, Shot
+from mi_ring.scene.tone_curve import ToneCurve
 
 PALE = np.array([0.5, 0.4, 0.3])  #: colour without print, linear
 MATTE = PALE / np.pi  #: the diffuse parameter of `cooktorrance` for it

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_ring.images import contrasted
 from mi_ring.metrics.brightness_samples import BrightnessSamples, surface_points
 from mi_ring.metrics.light_findings import Table, falloff_exponent, fit, light_findings
+from mi_ring.scene.tone_curve import contrasted
 
 NAMED, FLAT, FALLOFF = (
     "the room's light on the object is",

@@ -22,7 +22,8 @@ from mi_ring.capture.decoding import LinearImage, recorded
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.pixels import Pixels
 from mi_ring.geometry.camera import Camera
-from mi_ring.scene.shot import Response, Shot, ToneCurve, Window
+from mi_ring.scene.shot import Response, Shot, Window
+from mi_ring.scene.tone_curve import ToneCurve
 from mi_ring.synthesis.viewpoints import look_at
 from mi_ring.system import cache
 from mi_ring.system.cached_arrays import key_of

@@ -32,7 +32,7 @@ from mi_ring.rendering.views import Views
 from mi_ring.scene.assembly import with_lamps
 from mi_ring.scene.lights import shared_emitters
 from mi_ring.scene.lobes import Lobes
-from mi_ring.scene.shot import ToneCurve
+from mi_ring.scene.tone_curve import ToneCurve
 from mi_ring.system.machine import device
 
 #: All options of `--refine` with values in a calibration, in order.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from mi_ring.images import contrasted
+from mi_ring.scene.tone_curve import contrasted
 
 BLACK = 1e-6  #: radiance, in units of the file's full scale, below which an S curve is a straight line
 DARKEST = 1e-4  #: radiance, in units of the exposure, below which the power curve is a straight line

@@ -12,7 +12,8 @@ from mi_ring.errors import InputError, is_file
 from mi_ring.foreign import reading
 from mi_ring.image_headers import encoding_of, image_size
 from mi_ring.images import linear_to_srgb, mask_values, read_image
-from mi_ring.scene.shot import STRAIGHT, Encoding, Shot, ToneCurve
+from mi_ring.scene.shot import Encoding, Shot
+from mi_ring.scene.tone_curve import STRAIGHT, ToneCurve
 
 COMMON = 224, 248  #: the 8-bit values from the first to before the second are those of pixels that are not clipped
 FREQUENT = 1.5  #: values are clipped that are so many times as frequent

@@ -17,7 +17,8 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import LinearImage, clip_value, decode, is_linear, read_mask, read_photograph
 from mi_ring.capture.pixels import Pixels, Reader
 from mi_ring.images import ROWS, box_filter
-from mi_ring.scene.shot import Shot, ToneCurve, Window
+from mi_ring.scene.shot import Shot, Window
+from mi_ring.scene.tone_curve import ToneCurve
 from mi_ring.system import cache
 from mi_ring.system.cached_arrays import archived, key_of, read_archive, remembered
 from mi_ring.system.files import digest

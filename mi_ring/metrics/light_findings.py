@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_ring.images import contrasted
 from mi_ring.metrics.brightness_samples import BrightnessSamples
+from mi_ring.scene.tone_curve import contrasted
 
 FEWEST, FEWEST_POINTS = 12, 10  #: photographs; points in a photograph
 SEEN = 3  #: least number of photographs of a point

@@ -19,7 +19,8 @@ from mi_ring.photogrammetry.folder import DECODED, Picture
 from mi_ring.photogrammetry.reduced_photographs import ReducedView, reduce_photograph
 from mi_ring.photogrammetry.table_plane import Plane, TexelGrid, estimate_albedo
 from mi_ring.scene.lights import Light
-from mi_ring.scene.shot import Files, Response, Shot, ToneCurve
+from mi_ring.scene.shot import Files, Response, Shot
+from mi_ring.scene.tone_curve import ToneCurve
 from mi_ring.system.machine import in_threads
 
 MARGIN = 0.06  #: around the object in a crop [size of the object]

@@ -9,7 +9,8 @@ from mi_ring.geometry.camera import Camera
 from mi_ring.plugins.properties import LARGEST, beside_scene, number, number_list
 from mi_ring.rendering.pinhole import Pinhole
 from mi_ring.scene.lights import LAMP_CLASSES, light_of
-from mi_ring.scene.shot import Files, Response, Shot, ToneCurve
+from mi_ring.scene.shot import Files, Response, Shot
+from mi_ring.scene.tone_curve import ToneCurve
 
 #: Time of a photograph's rays. Other sensors have times of 0 and later: by the time the flash tells them apart.
 SHUTTER = -1.0

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mi_ring.geometry.camera import Camera, moved_pose
-from mi_ring.images import contrasted
 from mi_ring.scene.lights import Light
+from mi_ring.scene.tone_curve import STRAIGHT, ToneCurve
 
 #: How a file encodes linear values; `auto`: files of 8 bits are sRGB, all others are linear.
 Encoding: TypeAlias = Literal["auto", "srgb", "linear"]
@@ -52,41 +52,6 @@ class Window(NamedTuple):
     def share(self) -> float:
         """Area of the rectangle divided by the area of the photograph."""
         return float(np.prod(self.extent) / np.prod(self.whole))
-
-
-class ToneCurve(NamedTuple):
-    """A camera's tone curve: linear values x ≥ 0 become S(x ^ `gamma`). By default it changes nothing.
-
-    S is an S-curve with `contrast` and `toe`, as `mi_ring.images.contrasted` takes them.
-    """
-
-    gamma: float = 1.0
-    contrast: float = 1.0
-    toe: float = 0.0
-
-    def applied(self, linear: np.ndarray) -> np.ndarray:
-        """Apply the curve to linear values of any shape."""
-        powers = linear if self.gamma == 1 else np.maximum(linear, 0) ** self.gamma
-        return contrasted(powers, self.contrast, self.toe) if self.bent else powers
-
-    def removed(self, recorded: np.ndarray) -> np.ndarray:
-        """Undo the curve: compute linear values from recorded ones of any shape."""
-        contrast, toe = 1 / self.contrast, -self.contrast * self.toe
-        powers = contrasted(recorded, contrast, toe).astype(recorded.dtype) if self.bent else recorded
-        return powers if self.gamma == 1 else np.maximum(powers, 0) ** (1 / self.gamma)
-
-    @property
-    def bent(self) -> bool:
-        """True if the curve has an S."""
-        return (self.contrast, self.toe) != (1, 0)
-
-    def after(self, first: "ToneCurve") -> "ToneCurve":
-        """Return one curve for `first` and then this one. The S-curve of `first` acts on values to this `gamma`."""
-        toe = first.toe + self.toe / first.contrast
-        return ToneCurve(first.gamma * self.gamma, first.contrast * self.contrast, toe)
-
-
-STRAIGHT = ToneCurve()  #: changes nothing
 
 
 @dataclass(frozen=True)
