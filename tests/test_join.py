@@ -258,7 +258,7 @@ def test_files_that_cannot_be_joined_or_written(two):
         with pytest.raises(InputError, match=message):
             join.main([*map(str, paths)])
 
-    before = two.flash.read_bytes()
+    before, files = two.flash.read_bytes(), os.listdir(two.flash.parent)
     refused("small.xml: OUT.xml: exists already; give another name", two.flash, two.room, two.flash)
     refused("both.txt: OUT.xml: must end in .xml", two.flash, two.room, "both.txt")
     refused("small.xml: ROOM.xml: is FLASH.xml itself", two.flash, two.flash, two.out)
@@ -272,7 +272,7 @@ def test_files_that_cannot_be_joined_or_written(two):
     refused(r"a\$b/images/000.png: has a \$ in its path, which scene files take for a parameter", two.flash,
             "a$b/other.xml", two.out)  # fmt: skip
     assert two.flash.read_bytes() == before and not two.out.exists()
-    assert sorted(os.listdir(two.flash.parent)) == ["copy.xml", "images", "masks", "small.xml"]
+    assert {*os.listdir(two.flash.parent)} == {"copy.xml", *files}
 
 
 def test_a_third_capture_may_follow(two, capsys):
