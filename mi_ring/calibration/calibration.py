@@ -68,9 +68,8 @@ class Calibration(nn.Module):
         self.widths = {name: unknown.width_for(rig) for name, unknown in self.unknowns.items()}
         for name, unknown in self.unknowns.items():
             self.register_parameter(name, nn.Parameter(torch.zeros(unknown.shape(rig))))
-        if (
-            "light" in self.unknowns
-        ):  # a flash farther ahead looks like a darker surface: by default no gradient moves it
+        # A flash farther ahead looks like a darker surface: by default no gradient moves it there.
+        if "light" in self.unknowns:
             self.get_parameter("light").register_hook(lambda gradient: gradient * rig.free)
         #: Is one flash that moves with the cameras the only light that scene and photographs state?
         self.flash_alone = rig.flash is not None and bool(rig.lit.all()) and not shared_emitters(capture.scene)

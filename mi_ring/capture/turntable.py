@@ -17,8 +17,10 @@ MOST_BESIDE = 0.1  #: largest share of cameras that are on no ring
 def object_turned(capture: Capture) -> bool | None:
     """Tell whether the object turned while the camera stood still. None: neither cameras nor backgrounds tell it."""
     rings = on_rings(np.stack([shot.camera.to_world for shot in capture.shots]))
-    moves = background_moves(capture) if rings else None
-    return False if rings is False else None if moves is None else not moves
+    if not rings:
+        return rings
+    moves = background_moves(capture)
+    return None if moves is None else not moves
 
 
 def on_rings(poses: np.ndarray) -> bool | None:

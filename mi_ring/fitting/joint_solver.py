@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mi_ring.calibration.calibration import Calibration
+from mi_ring.calibration.unknowns import DOUBT_AHEAD
 from mi_ring.fitting.comparison import ROOM
 from mi_ring.fitting.joint_equations import JointEquations
 from mi_ring.fitting.model import Model
@@ -75,12 +76,10 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
             solution[place] = ahead_of_lens(layout, covariance, covariance @ right)
             own = own[own != place]
         others = np.setdiff1d(np.arange(layout.count), own)
-        system, right = (
-            joint.matrix[np.ix_(own, own)],
-            right[own] - joint.matrix[np.ix_(own, others)] @ solution[others],
-        )
+        system, beside = joint.matrix[np.ix_(own, own)], joint.matrix[np.ix_(own, others)]
+        right = right[own] - beside @ solution[others]
         solution[own], width = with_learnt_width(layout, exposure, own, system, right)
-        share = max(0.0, 1 - (DOUBT_OF_EXPOSURES / width) ** 2)  # the less exposures differ, the more all stay
+        share = credible(width, DOUBT_OF_EXPOSURES)  # the less exposures differ, the more all stay
         solution[own] = current[own] + share * (solution[own] - current[own])
         for name in names:
             value = solution[layout.places(name)].reshape(calibration.get_parameter(name).shape)
@@ -93,12 +92,19 @@ def ahead_of_lens(layout: Layout, covariance: np.ndarray, solution: np.ndarray) 
     """Return how far a flash is believed to be ahead of where the capture says, in the unit of `LightPlace`.
 
     Brightness alone does not tell it, but how brightness changes with the distance. `covariance` (N, N), `solution`
-    (N,): of all unknowns together. The share that is believed is that of `believed`.
+    (N,): of all unknowns together.
     """
-    place, unknown = layout.places("light")[2], layout.calibration.unknowns["light"]
-    doubt = np.ravel(unknown.doubt_for(layout.calibration.rig))[2] / layout.calibration.widths["light"]
-    variance = covariance[place, place] + doubt**2
-    return float(solution[place] * max(0.0, 1 - variance / max(solution[place] ** 2, variance)))
+    place = layout.places("light")[2]
+    error = np.hypot(covariance[place, place] ** 0.5, DOUBT_AHEAD / layout.calibration.widths["light"])
+    return float(solution[place] * credible(solution[place], error))
+
+
+def credible(value: float, error: float) -> float:
+    """Return the share of a value that is used: 1 − error² / value², at least 0.
+
+    It is that of "Estimation with quadratic loss" (James and Stein 1961). `error`: standard deviation of the value.
+    """
+    return max(0.0, 1 - (error / value) ** 2) if value else 0.0
 
 
 def with_learnt_width(
@@ -126,15 +132,15 @@ def believed(calibration: Calibration, more: np.ndarray, deviation: np.ndarray) 
     """Return the share, 0 to 1, of found room light that a fit uses.
 
     `more` (BASIS, 3): the light that was found beyond that of the capture. `deviation` (BASIS, 3): standard deviation
-    of its first harmonic. The share is 1 − error² / light², as in "Estimation with quadratic loss" (James and Stein
-    1961). The error has three parts: the deviation, the difference of the colours, and `doubt`.
+    of its first harmonic. The error of the light has three parts: the deviation, the difference of the colours, and
+    `doubt`.
     """
     if (least := doubt(calibration)) == 0:
         return 1.0
     light, error = (calibration.room_share(torch.from_numpy(part)).double() for part in (more, deviation))
     mean = float(light.mean())
     variance = float(error.mean()) ** 2 + float(light.var()) / 3 + least**2
-    return max(0.0, 1 - variance / mean**2) if mean > 0 else 0.0
+    return credible(mean, variance**0.5) if mean > 0 else 0.0
 
 
 def doubt(calibration: Calibration) -> float:
