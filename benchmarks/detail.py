@@ -27,6 +27,7 @@ from mi_ring.rendering import prediction
 from mi_ring.rendering.image_formation import render_maps
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
+from mi_ring.scene.mesh_texture import remove_texture
 from mi_ring.scene.shot import Shot
 
 # isort: split
@@ -76,7 +77,7 @@ class Maps:
             self.surface = Surface(capture.scene, capture.shape, self.ring)
             self.surface.show(self.ring, *self.ring.domain.sample(self.ring.subdivisions))
             if not textured:
-                self.surface.texture = None
+                remove_texture(self.surface.shape.bsdf())
         else:
             self.scene = mi.load_dict({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
 

@@ -64,6 +64,7 @@ PLUGINS = {
     "table": "mi_ring.plugins.table.Table",
     "cooktorrance": "mi_ring.plugins.cooktorrance.CookTorrance",
     "merl": "mi_ring.plugins.merl.Merl",
+    "fine_attribute": "mi_ring.plugins.fine_attribute.FineAttribute",
     "photometric": "mi_ring.plugins.photometric.Photometric",
 }
 

@@ -26,7 +26,7 @@ from mi_ring import __main__
 from mi_ring.importers.formats import FORMATS
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import ring_state
-from mi_ring.plugins import cooktorrance, flash, merl, photograph, photometric, room, shapenet, table
+from mi_ring.plugins import cooktorrance, fine_attribute, flash, merl, photograph, photometric, room, shapenet, table
 from mi_ring.rendering.measured_brdf import LAYERS
 
 ROOT = Path(__file__).parents[1]
@@ -38,7 +38,7 @@ def plugins():
     return {
         "photograph": photograph.Photograph, "flash": flash.Flash, "room": room.Room, "shapenet": shapenet.ShapeNetMesh,
         "cooktorrance": cooktorrance.CookTorrance, "merl": merl.Merl, "table": table.Table,
-        "photometric": photometric.Photometric,
+        "photometric": photometric.Photometric, "fine_attribute": fine_attribute.FineAttribute,
     }  # fmt: skip
 
 
@@ -247,6 +247,7 @@ def values(tmp_path):
         "merl": [{"filename": str(networks), "material": "one"}],
         "table": [{"to_world": moved, "bsdf": {"type": "diffuse", "reflectance": grey}}],
         "photometric": [{"shadows": False}],
+        "fine_attribute": [{"name": "vertex_colour"}],
     }  # fmt: skip
 
 

@@ -3,7 +3,8 @@
 After a fit, surface, light and material are known. The ratio of a photograph to its prediction, without highlights, is
 what the fitted colours lack. Each point of the surface gets the mean ratio of the photographs that show it, as in the
 texture mapping of photogrammetry. Shading is divided out, so the colours stay free of light. Coarse differences are
-left out: they are errors of light or shape.
+left out: they are errors of light or shape. Photographs that disagree with the others, as with a wrong pose, weigh
+less: what they have added is taken out again.
 """
 
 import math
@@ -20,7 +21,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import read_photograph
 from mi_ring.capture.observation import Observation, observed
 from mi_ring.capture.reduction import HIGHEST, reduced_image, windowed
-from mi_ring.fitting.surface_ratios import Points, Ratios, bilinear
+from mi_ring.fitting.surface_ratios import Comparison, Points, Ratios, bilinear
 from mi_ring.geometry.camera import pixels_per_unit
 from mi_ring.geometry.hull import evenly_spaced
 from mi_ring.geometry.meshes import area_of
@@ -197,6 +198,7 @@ def sharpened(
     wanted = resolution * math.sqrt(area / len(faces))  # divisions of a triangle, for one point in each pixel
     divisions = max(1, min(math.ceil(wanted), math.isqrt(MOST_POINTS // len(faces))))
     ratios = Ratios(Points.of(faces, divisions))
+    comparison, trust = Comparison(ratios.points, predictor.s.numpy(), len(index)), np.ones(len(index))
 
     def predicted(k: int) -> Expected:
         release_memory()  # of the photograph before
@@ -210,13 +212,20 @@ def sharpened(
         weights *= (camera.focal.mean() / resolution / distance) ** 2
         triangles = np.flatnonzero(expected.visible[faces].all(1))
         photograph, (pixels, _) = with_usable_pixels(enlarged(before, k, *shots[k])), camera.project(vertices)
-        half, parts = index.index(k) % 2, 1 + len(triangles) * len(ratios.points.shares) // AT_ONCE
+        number, parts = index.index(k), 1 + len(triangles) * len(ratios.points.shares) // AT_ONCE
+        again = trust[number] < 1
         for part in np.array_split(triangles, parts):
             logarithms, usable = ratios_of(expected, photograph, ratios.points, part, pixels)
             weight = usable * ratios.points.at(weights[:, None], part)[..., 0]
-            ratios.add(half, part, logarithms, weight)
+            ratios.add(number % 2, part, logarithms, weight * (trust[number] - again))
+            if not again:
+                comparison.add(number, part, logarithms, weight)
 
     for _ in progress(pipelined(predicted, compare, index), "texture", len(index)):
+        pass
+    trust = comparison.trust()
+    doubtful = [k for k, share in zip(index, trust) if share < 1]
+    for _ in progress(pipelined(predicted, compare, doubtful), "texture without what disagrees", len(doubtful)):
         pass
     own = [at_width(before.shots[k], refined.shots[k], min(width, widest))[1].camera for k in index]
     coarser = resolution / pixels_per_unit(own, ring.center.cpu().numpy())

@@ -1,15 +1,20 @@
 """Ratios of photographs and predictions, at points of the surface."""
 
+import warnings
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from mi_ring.objects.detail import Grid
 
 SOLVING = 4  #: steps to find the values of the corners of a grid
 CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have in common
+PATCHES, PATCH = 300, 64  #: places at which photographs are compared with each other, and number of points of each
+FEWEST, LEAST = 3, 0.01  #: number of photographs that are compared with each other; least weight of one
+USUAL = 2.0  #: mean squares of differences up to this multiple of their median say nothing against a photograph
 
 
 class Points(NamedTuple):
@@ -121,3 +126,43 @@ class Ratios:
         variances = low_pass.of(np.column_stack([common, different]), both.sum(1)).clip(min=0)
         share = self.points.at(variances[:, :1] / np.maximum(variances.sum(1, keepdims=True), 1e-12))
         return share * (means * self.weights[..., None]).sum(0) / np.maximum(total, 1e-9)[..., None]
+
+
+class Comparison:
+    """Ratios of each photograph in small patches of a surface. They show which photographs disagree with the others.
+
+    `points`: those of the ratios; the first one in a triangle is used. `s` (V, 3): vertices on the domain. `count`:
+    number of photographs.
+    """
+
+    def __init__(self, points: Points, s: np.ndarray, count: int) -> None:
+        centres = s[points.faces].mean(1)
+        some = np.linspace(0, len(centres) - 1, min(PATCHES, len(centres))).astype(int)
+        near = cKDTree(centres).query(centres[some], min(PATCH, len(centres)))[1]
+        self.triangles = near.reshape(len(some), -1)  #: (patches, points)
+        self.ratios = np.full((count, *self.triangles.shape, 3), np.nan, np.float32)
+
+    def add(self, photograph: int, triangles: np.ndarray, logarithms: np.ndarray, weights: np.ndarray) -> None:
+        """Add what a photograph shows. `triangles` (f,): indices. `logarithms` (f, n, 3). `weights` (f, n)."""
+        place = np.full(self.triangles.max() + 1 + triangles.max(initial=0), -1)
+        place[triangles] = np.arange(len(triangles))
+        here = place[self.triangles]
+        shown = (here >= 0) & (weights[here, 0] > 0 if len(weights) else False)
+        self.ratios[photograph][shown] = logarithms[here[shown], 0]
+
+    def trust(self) -> np.ndarray:
+        """Return weights (count,) of the photographs: 1, or down to `LEAST` if one differs from the median of all.
+
+        Of each patch, only differences from its mean count: light and shape of the fit are not exact.
+        """
+        seen = np.isfinite(self.ratios[..., 0])
+        seen &= seen.sum(2, keepdims=True) >= self.triangles.shape[1] / 2
+        seen &= seen.sum(0) >= FEWEST
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # some patches are seen by no photograph
+            fine = np.where(seen[..., None], self.ratios, np.nan)
+            fine -= np.nanmean(fine, 2, keepdims=True)
+            squares = np.nanmean(np.square(fine - np.nanmedian(fine, 0)), (1, 2, 3))
+            usual = USUAL * np.nanmedian(squares)
+        excess = np.where(squares > usual, squares / usual, 1.0)  # 1 where nothing can be compared
+        return np.maximum(excess**-2, LEAST)

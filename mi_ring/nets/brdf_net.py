@@ -100,6 +100,10 @@ class MaterialNet(nn.Module):
         """
         return None
 
+    def texture_cell(self) -> float | None:
+        """Return the size of the texture's finest detail, a length on its domain. Returns None without a texture."""
+        return None
+
     def fine(self, s: Tensor) -> dict[str, Tensor]:
         """Compute the parameters, with the texture, at domain points (..., 3)."""
         values, factors, colour = self(s), self.texture(s), albedo_of(self.bsdf_parameters)

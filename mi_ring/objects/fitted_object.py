@@ -17,6 +17,7 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.assembly import assembled
 from mi_ring.scene.lights import Light, usable_light
+from mi_ring.scene.mesh_texture import write_texture
 from mi_ring.scene.shot import Shot
 
 FINEST, MOST_SPP = 10, 10**4  #: largest level of the mesh and number of samples per pixel of a picture
@@ -106,6 +107,7 @@ class FittedObject(nn.Module):
         surface = Surface(assembled([shape]), shape, self)
         s, faces = self.domain.sample(level)
         surface.set_faces(faces)
+        write_texture(surface.shape.bsdf(), self.brdf_net, s, faces)
         vertices, material = self(s.to(self.center.device))
         return prediction.render(surface, view, vertices, material, spp, seed, shadows)[0][0]
 

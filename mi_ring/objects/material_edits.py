@@ -94,6 +94,9 @@ class TransferredMaterial(MaterialNet):
     def texture(self, s: Tensor) -> Tensor | None:
         return self.net.texture(self.corresponding(s))
 
+    def texture_cell(self) -> float | None:
+        return self.net.texture_cell()  # domains are about equally large
+
     def corresponding(self, s: Tensor) -> Tensor:
         """Return the points (..., 3) of the other domain that correspond to points (..., 3) of this one."""
         points = self.there.to_domain(self.here.to_sphere(s.detach().reshape(-1, 3).cpu().numpy()))
@@ -115,6 +118,9 @@ class EditedMaterial(MaterialNet):
 
     def texture(self, s: Tensor) -> Tensor | None:
         return self.net.texture(s)
+
+    def texture_cell(self) -> float | None:
+        return self.net.texture_cell()
 
     def edited(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
         """Apply gains and offsets to parameters, in place. Returns them."""

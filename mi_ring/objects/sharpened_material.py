@@ -46,3 +46,6 @@ class SharpenedMaterial(MaterialNet):
 
     def texture(self, s: Tensor) -> Tensor:
         return torch.exp(self.grid(s.reshape(-1, 3)).reshape(s.shape))
+
+    def texture_cell(self) -> float:
+        return self.grid.cells[-1]

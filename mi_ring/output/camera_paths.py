@@ -240,9 +240,6 @@ def render_views(
         if view.time != shown:
             surface.show(ring, s, faces, view.time)
             shown = view.time
-        if k == 0 and integrator and surface.texture:
-            print("Colours are those of the mesh: the finer texture is drawn by photometric, or from mi-ring export "
-                  "RUN FILE.xml")  # fmt: skip
         if integrator:
             sensor = view.sensor or load_element(photograph_element(view.shot))
             yield render_passes(surface.scene, sensor, integrator, config.spp, seed=k)

@@ -10,7 +10,6 @@ import torch
 from mi_ring.errors import InputError
 from mi_ring.geometry.meshes import area_of
 from mi_ring.objects.fitted_object import FittedObject
-from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.output import gltf
 from mi_ring.output.atlas import rasterise, reflectances, unwrap
 from mi_ring.output.mitsuba_scene import Lit, write_scene
@@ -76,9 +75,8 @@ def resolution_of(ring: FittedObject) -> int:
     """Choose the width of the textures of an object [px]: 2048, or 4096 if its own texture is finer than that."""
     s, faces = ring.domain.sample(AREA_LEVEL)
     area = area_of(s, torch.from_numpy(faces))
-    textures = [part.grid for part in ring.brdf_net.modules() if isinstance(part, SharpenedMaterial)]
-    finer = any(area / grid.cells[-1] ** 2 > FILLED * RESOLUTION**2 for grid in textures)
-    return FINE_RESOLUTION if finer else RESOLUTION
+    cell = ring.brdf_net.texture_cell()
+    return FINE_RESOLUTION if cell and area / cell**2 > FILLED * RESOLUTION**2 else RESOLUTION
 
 
 def require_exportable(

@@ -22,6 +22,8 @@ from mi_ring.scene.plain_mesh import mesh_of
 from mi_ring.scene.shot import Shot
 from mi_ring.system.files import write_file
 
+ATTRIBUTES = "mesh_attribute", "fine_attribute"  #: plugins that read mesh attributes
+
 
 class Lit(NamedTuple):
     """A photograph and the light of its room. None: no such light."""
@@ -101,7 +103,7 @@ def write_scene(
             bitmap(conductor, name, width, "alpha")
     else:
         shape.append(element)
-        for texture in [t for t in element.iter("texture") if t.get("type") == "mesh_attribute"]:
+        for texture in [t for t in element.iter("texture") if t.get("type") in ATTRIBUTES]:
             name = texture.get("name", "")
             parent = next(e for e in element.iter() if texture in e)
             parent.remove(texture)

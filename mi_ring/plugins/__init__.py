@@ -7,7 +7,7 @@ import importlib
 import sys
 
 #: Ordered so that each comes after those that it imports.
-PLUGINS = ("photograph", "flash", "room", "cooktorrance", "merl", "shapenet", "table", "photometric")
+PLUGINS = ("photograph", "flash", "room", "fine_attribute", "cooktorrance", "merl", "shapenet", "table", "photometric")
 
 
 def register() -> None:

@@ -38,7 +38,7 @@ class CookTorrance(mi.BSDF):
     Parameter             Type              Description                                                       Flags
     ===================== ================= ================================================================= =====
     ``diffuse``           rgb or texture    ρᵈ; the diffuse term has no 1/π. Default: the mesh attribute      P, ∂
-                                            ``vertex_diffuse``
+                                            ``vertex_diffuse``, by `fine_attribute`
     ``specular``          float or texture  ρᵞ; it contains the Fresnel factor, which is constant. Default:   P, ∂
                                             the mesh attribute ``vertex_specular``
     ``roughness``         float or texture  r, the width α of the distribution, at least 0.02. Default: the   P, ∂
@@ -130,7 +130,8 @@ class CookTorrance(mi.BSDF):
         self.textures = {}
         for name in self.channels:
             if name not in props:
-                props[name] = mi.load_dict({"type": "mesh_attribute", "name": f"vertex_{name}"})
+                kind = "fine_attribute" if name == "diffuse" else "mesh_attribute"
+                props[name] = mi.load_dict({"type": kind, "name": f"vertex_{name}"})
             self.textures[name] = props.get_unbounded_texture(name)
         side = mi.BSDFFlags.FrontSide
         self.m_components = [mi.BSDFFlags.DiffuseReflection | side, mi.BSDFFlags.GlossyReflection | side]

@@ -55,7 +55,8 @@ class ShapeNetMesh(mi.Mesh):
     predicts. For `cooktorrance` these are ``vertex_diffuse`` (3 channels), ``vertex_specular``, ``vertex_roughness``
     and, unless the fit had ``--diffuse lambert``, ``vertex_diffuse_roughness`` (1 each). Without ``weights`` the mesh
     has the first three, with the values 0.5, 0 and 0.5. An error is raised if the nested BSDF needs an attribute that
-    the mesh does not have, or reads one with another number of channels.
+    the mesh does not have, or reads one with another number of channels. If the fit has a texture that is finer than
+    the mesh, it is given to each `fine_attribute` of the nested BSDF, such as the colour of a `cooktorrance`.
 
     What it does not do: texture coordinates; colours in spectral variants, where Mitsuba reads attributes of three
     channels as coefficients of a spectrum.
@@ -83,6 +84,7 @@ class ShapeNetMesh(mi.Mesh):
         from mi_ring.geometry.domain import Sphere, closed_domain
         from mi_ring.geometry.meshes import load_closed_mesh
         from mi_ring.objects.ring_file import load_fit
+        from mi_ring.scene.mesh_texture import write_texture
 
         self.subdivisions = props.get("subdivisions", 5)
         if not isinstance(self.subdivisions, int) or self.subdivisions not in range(9):
@@ -151,6 +153,8 @@ class ShapeNetMesh(mi.Mesh):
         params.update()
         for name, value in material.items():
             self.add_attribute(f"vertex_{name}", value[0].numel(), value.contiguous().numpy().ravel())
+        if self.ring is not None:
+            write_texture(self.bsdf(), self.ring.brdf_net, s, faces)
         require_attributes(self)
 
     def to_string(self):

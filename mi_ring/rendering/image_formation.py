@@ -6,6 +6,7 @@ import mitsuba as mi
 from mi_ring.rendering.direct_light import next_2d, trace
 from mi_ring.rendering.edge_gradients import boundary_terms
 from mi_ring.rendering.photographs import center_rays, pixel_rays
+from mi_ring.scene.mesh_attributes import fine_textures
 
 
 def render_photographs(scene, photographs, spp, seed, shadows=True, edges=None, pixels=None):
@@ -37,8 +38,9 @@ def render_maps(scene, photographs, attributes, pixels=None):
     """Render normals and mesh attributes at pixel centres. Returns [nx, ny, nz, first attribute, …].
 
     These are Floats of N·H·W pixels for the N selected photographs. Normals are in world space. Values are 0 where a
-    pixel shows no surface, or a surface without the attribute. `attributes`: number of channels (1 or 3) by name of the
-    attribute. `pixels`: range of pixels (first, last + 1), numbered through all photographs; None: all.
+    pixel shows no surface, or a surface without the attribute. Those of a `fine_attribute` are as fine as it is.
+    `attributes`: number of channels (1 or 3) by name of the attribute. `pixels`: range of pixels (first, last + 1),
+    numbered through all photographs; None: all.
     """
     si = scene.ray_intersect(center_rays(photographs, pixels)[0])
     maps = [dr.select(si.is_valid(), n, 0) for n in si.sh_frame.n]
@@ -47,8 +49,11 @@ def render_maps(scene, photographs, attributes, pixels=None):
         for shape in scene.shapes():
             if shape.is_mesh() and shape.has_attribute(name):
                 here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
-                one = channels == 1
-                found = [shape.eval_attribute_1(name, si, here)] if one else shape.eval_attribute_3(name, si, here)
+                fine = [texture for texture in fine_textures(shape.bsdf()) if texture.attribute == name]
+                if channels == 1:
+                    found = [shape.eval_attribute_1(name, si, here)]
+                else:
+                    found = fine[0].eval_3(si, here) if fine else shape.eval_attribute_3(name, si, here)
                 values = [dr.select(here, new, old) for new, old in zip(found, values)]
         maps += values
     return maps

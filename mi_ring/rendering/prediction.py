@@ -10,17 +10,16 @@ import torch
 from torch import Tensor
 
 from mi_ring.geometry.meshes import area_vectors
-from mi_ring.nets.brdf_net import COOK_TORRANCE, SPECULAR, Parameter, albedo_of
+from mi_ring.nets.brdf_net import COOK_TORRANCE, SPECULAR, Parameter
 from mi_ring.rendering.bridge import differentiable, evaluated, to_drjit
 from mi_ring.rendering.edge_selection import Edges
 from mi_ring.rendering.global_illumination import GlobalIllumination
-from mi_ring.rendering.image_formation import find_triangles, render_maps, render_photographs
+from mi_ring.rendering.image_formation import render_maps, render_photographs
 from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.rendering.views import Views
 from mi_ring.scene.plain_mesh import POSITIONS
 
-TEXTURE_RAYS, MOST_RAYS = 4, 16  #: least and largest number in a pixel
 NO_AREA = 1e-6  #: twice a triangle's area / (longest side)² below which float32 gives no normal
 
 
@@ -121,48 +120,19 @@ def draw(
             rgb = rgb + added.interreflection
         if rows and occlusion:
             rgb = (rgb + added.occlusion(torch.from_numpy(photographs.room_strengths).to(rgb))).clamp(min=0)
-    if surface.texture:
-        with without_gloss(surface) as is_other:
-            how = spp, seed, shadows, indirect, paths, occlusion
-            matte = draw(surface, photographs, *how)[0] if is_other else rgb.cpu()
-        rgb = rgb.cpu() + matte * (
-            texture_factors(surface, photographs, seed, min(max(spp, TEXTURE_RAYS), MOST_RAYS)) - 1
-        )
     return rgb.cpu(), coverage.cpu()
 
 
 @contextmanager
-def without_gloss(surface: Surface) -> Iterator[bool]:
-    """Show the surface without highlights and without its texture. Yields False if it has no highlights."""
+def without_gloss(surface: Surface) -> Iterator[None]:
+    """Show the surface without highlights."""
     names = [f"vertex_{name}" for name in SPECULAR if surface.prefix + f"vertex_{name}" in surface.params]
     gloss = {name: mi.Float(surface.params[surface.prefix + name]) for name in names}  # not references
-    texture = surface.texture
-    surface.texture = None
     surface.write_arrays({name: 0 * value for name, value in gloss.items()})
     try:
-        yield bool(gloss)
+        yield
     finally:
-        surface.texture = texture
         surface.write_arrays(gloss)
-
-
-@torch.no_grad()
-def texture_factors(surface: Surface, photographs: Photographs, seed: int = 0, rays: int = TEXTURE_RAYS) -> Tensor:
-    """Compute the factors (N, H, W, 3) by which the texture changes the matte light of pixels, from `rays` in each."""
-    own, s, parts = photographs.in_units(surface.unit), surface.s.numpy(force=True), []
-    for pixels in photographs.chunks(rays):
-        hits = find_triangles(surface.scene, surface.shape, own, rays, seed, pixels)
-        shown, triangle, *place = map(np.array, hits)
-        u, v = (share[shown, None] for share in place)
-        a, b, c = surface.faces[triangle[shown]].T
-        factors = torch.zeros(len(shown), 3)
-        if shown.any():
-            points = torch.from_numpy((1 - u - v) * s[a] + u * s[b] + v * s[c])
-            factors[torch.from_numpy(shown)] = surface.texture(points)
-        number = torch.from_numpy(shown).reshape(-1, rays).sum(1, keepdim=True)
-        mean = factors.reshape(-1, rays, 3).sum(1) / number.clamp(min=1)
-        parts.append(torch.where(number > 0, mean, 1.0))
-    return torch.cat(parts).reshape(*photographs.shape, 3)
 
 
 def maps(
@@ -184,7 +154,4 @@ def maps(
     for p in parameters:
         result[p.name] = channels[..., first : first + 3] if p.channels == 3 else channels[..., first]
         first += p.channels
-    if surface.texture and (colour := albedo_of(parameters)):
-        factors = texture_factors(surface, photographs).numpy()
-        result[colour.name] = (result[colour.name] * factors).clip(colour.low, colour.high)
     return result

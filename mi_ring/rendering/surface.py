@@ -1,7 +1,6 @@
 """The surface that is rendered: the `shapenet` shape of a scene, to whose mesh torch tensors are written."""
 
 import math
-from collections.abc import Callable
 
 import mitsuba as mi
 import numpy as np
@@ -13,6 +12,7 @@ from mi_ring.rendering.edge_selection import Edges
 from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.assembly import RenderedObject, lamp_lights, move_lamps, split_tables, with_fitted_shape, with_lamps
 from mi_ring.scene.lights import shared_emitters
+from mi_ring.scene.mesh_texture import remove_texture, write_texture
 from mi_ring.scene.plain_mesh import FACES, POSITIONS
 
 RADII_IN_SCENE_UNITS = 1e-3, 1e4  #: the least and the largest radius that float32 renders well in scene units
@@ -49,9 +49,6 @@ class Surface:
         self.faces_changed = False
         self.edges: Edges | None = None  #: those of the last picture with gradients of moving edges
         self.written = 0  #: number of times that vertices were written
-        self.s = torch.zeros(0, 3)  #: (V, 3) points of the domain that `show` has written
-        #: of the object that `show` has written: factors (n, 3) at points (n, 3) of the domain, on the CPU
-        self.texture: Callable[[Tensor], Tensor] | None = None
 
     def set_faces(self, faces: np.ndarray) -> None:
         """Set other triangles (F, 3). Vertices and attributes must be written again before the next rendering."""
@@ -82,7 +79,7 @@ class Surface:
         `vertices` (V, 3) [scene units]. `attributes`: (V, 3) or (V,) by name. Raises ValueError if V is not the number
         of vertices that the triangles need, or if an attribute has another size.
         """
-        self.texture = None  # it is of another object
+        remove_texture(self.shape.bsdf())  # it is of another object
         self.write_arrays({name: to_drjit(t) for name, t in self.parameters(vertices, attributes).items()})
 
     def write_arrays(self, arrays: dict[str, mi.Float]) -> None:
@@ -119,9 +116,7 @@ class Surface:
         with torch.no_grad():
             self.set_faces(faces)
             self.write(*ring(s.to(ring.center.device), time))
-            device, texture = ring.center.device, ring.brdf_net.texture
-            if texture(s[:1].to(device)) is not None:
-                self.s, self.texture = s, lambda points: texture(points.to(device)).cpu()
+            write_texture(self.shape.bsdf(), ring.brdf_net, s, faces)
 
 
 def unit_for(radius: float) -> float:

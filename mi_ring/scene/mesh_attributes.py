@@ -39,12 +39,24 @@ def attribute_of(texture) -> str | None:
 
     Raises SceneError if the name cannot be found.
     """
+    if is_fine(texture):
+        return texture.attribute
     if texture.class_name() != "MeshAttribute":
         return None
     name = re.match(r'MeshAttribute\[\s*name = "([^"]+)"', str(texture))  # Mitsuba has it nowhere else
     if not name:
         raise SceneError(f"bsdf: the mesh attribute is unknown that is read by {' '.join(str(texture).split())}")
     return name[1]
+
+
+def is_fine(texture) -> bool:
+    """Return True if a texture is a `fine_attribute`, in any variant of Mitsuba."""
+    return hasattr(texture, "set_factors")
+
+
+def fine_textures(bsdf) -> list:
+    """List the textures of a BSDF that are `fine_attribute`."""
+    return [texture for _, texture in textures_of(bsdf) if is_fine(texture)]
 
 
 def attributes_of(bsdf) -> set[str]:

@@ -1,0 +1,174 @@
+"""The plugin `fine_attribute`: factors on lattices in triangles, in Mitsuba's own integrators and in ours."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+from mi_ring.geometry.camera import Camera
+from mi_ring.nets.brdf_net import MaterialNet
+from mi_ring.objects.detail import Grid
+from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.ring_file import ring_state
+from mi_ring.objects.sharpened_material import SharpenedMaterial
+from mi_ring.scene.lights import Light
+from mi_ring.scene.mesh_attributes import fine_textures
+from mi_ring.scene.mesh_texture import divisions_for, lattice, write_texture
+from mi_ring.system.files import write_state
+
+COLOUR = {"type": "fine_attribute", "name": "vertex_diffuse"}
+KINDS = {
+    "cooktorrance": {"type": "cooktorrance"},
+    "principled": {"type": "principled", "base_color": COLOUR, "roughness": 0.8},
+    "nested": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": COLOUR}},
+}
+SIZE = 48
+
+
+def sphere(bsdf, level=1):
+    return mi.load_dict({"type": "shapenet", "subdivisions": level, "flash": False, "bsdf": bsdf})
+
+
+def triangles(shape):
+    params = mi.traverse(shape)
+    points, faces = (np.array(params[name]).reshape(-1, 3) for name in ("vertex_positions", "faces"))
+    return torch.from_numpy(points.astype(np.float32)), faces
+
+
+class Coloured(MaterialNet):
+    """A material whose texture is a function of the point."""
+
+    def __init__(self, texture, cell):
+        super().__init__()
+        self.function, self.cell = texture, cell
+
+    def texture(self, s):
+        return self.function(s)
+
+    def texture_cell(self):
+        return self.cell
+
+
+def waves(s):
+    return 1 + 0.3 * torch.sin(5 * s + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def picture(shape, spp=64, **integrator):
+    camera = {"type": "perspective", "fov": 40, "sampler": {"type": "independent", "seed": 3},
+              "to_world": mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 1, 0]),
+              "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}}  # fmt: skip
+    lights = {"type": "point", "position": [2, 2, 3], "intensity": 20.0}
+    scene = {"type": "scene", "shape": shape, "camera": camera, "light": lights,
+             "integrator": integrator or {"type": "path", "max_depth": 2}}  # fmt: skip
+    return np.array(mi.render(mi.load_dict(scene), spp=spp))[..., :3]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pictures_of_stock_integrators_have_the_texture(kind):
+    """The ratio of pictures with and without it is its value where the ray meets the surface: here at most 2 % off."""
+    shape = sphere(KINDS[kind], 3)
+    plain = picture(shape)
+    write_texture(shape.bsdf(), Coloured(waves, 0.02), *triangles(shape))
+    ratio = picture(shape) / np.maximum(plain, 1e-6)
+    where = picture(sphere({"type": "diffuse"}, 3), spp=1, type="aov", aovs="p:position")
+    solid = (plain.min(-1) > 0.3 * plain.max()) & (np.linalg.norm(where, axis=-1) > 0.9)
+    expected = waves(torch.from_numpy(where[solid])).numpy()
+    assert solid.sum() > 400
+    assert np.ptp(expected, 0).min() > 0.4
+    tolerance = 0.1 if kind == "principled" else 0.05  # it has highlights, and pixels show more than one point
+    assert np.abs(ratio[solid] - expected).mean() < tolerance / 3
+    assert np.quantile(np.abs(ratio[solid] - expected), 0.95) < tolerance
+
+
+@pytest.mark.parametrize("divisions", [1, 2, 5])
+def test_linear_functions_are_reproduced(divisions):
+    """Anywhere in a triangle; with random factors of the corners, which no symmetry helps."""
+    shape = sphere(KINDS["cooktorrance"], 0)
+    rng = np.random.default_rng(divisions)
+    _, faces = triangles(shape)
+    corners = rng.uniform(0.5, 2, (len(faces), 3, 3)).astype(np.float32)
+    (texture,) = fine_textures(shape.bsdf())
+    factors = np.einsum("nk,fkc->fnc", lattice(divisions).numpy(), corners)
+    texture.set_factors(mi.Float(factors.ravel()), divisions)
+    triangle, place = rng.integers(len(faces), size=500), rng.uniform(size=(500, 2)).astype(np.float32)
+    place = np.where(place.sum(1, keepdims=True) > 1, 1 - place, place)
+    si = dr.zeros(mi.SurfaceInteraction3f, 500)
+    si.prim_index, si.uv = mi.UInt32(triangle.astype(np.uint32)), mi.Point2f(place.T)
+    found = np.array(texture.factor(si, mi.Bool(True))).T
+    shares = np.column_stack([1 - place.sum(1), place])
+    np.testing.assert_allclose(found, np.einsum("nk,nkc->nc", shares, corners[triangle]), rtol=1e-4)
+
+
+def test_gradients_reach_the_factors():
+    """By `mi.render`: factors times gradients are the matte light, the difference to the picture of a black object."""
+    shape = sphere(KINDS["nested"], 0)
+    write_texture(shape.bsdf(), Coloured(waves, 0.5), *triangles(shape))
+    scene = mi.load_dict({
+        "type": "scene", "shape": shape, "light": {"type": "constant"}, "integrator": {"type": "path", "max_depth": 2},
+        "camera": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 1, 4], [0, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 16, "height": 16}},
+    })  # fmt: skip
+    params = mi.traverse(scene)
+    (key,) = [name for name, _ in params if name.endswith("factors")]
+    factors = np.array(params[key]).reshape(-1, 3)
+    dr.enable_grad(params[key])
+    params.update()
+    light = mi.render(scene, params, spp=256, seed=1)
+    dr.backward(dr.mean(light[..., 1], axis=None))
+    gradient = np.array(dr.grad(params[key])).reshape(-1, 3)
+    params[key] = 0 * factors.ravel()
+    params.update()
+    matte = np.array(light - mi.render(scene, spp=256, seed=1))[..., 1].mean()
+    assert (gradient[:, 1] * factors[:, 1]).sum() == pytest.approx(matte, rel=0.02)
+    assert (gradient[:, 1] != 0).sum() > 0.3 * len(gradient)
+    assert not gradient[:, [0, 2]].any()
+
+
+def test_a_saved_fit_shows_its_texture_in_a_scene_of_ones_own(tmp_path):
+    """In `<shape type="shapenet">` by the path tracer, as `mi_ring.rendering` draws it."""
+    ring = FittedObject(np.zeros(3), 1.0, subdivisions=4)
+    with torch.no_grad():
+        for parameter in ring.parameters():
+            parameter.zero_()
+    s, _ = ring.domain.sample(4)
+    grid = Grid.around(s, 0.1, 1, 3)
+    grid.values[0].data = torch.rand(grid.values[0].shape, generator=torch.Generator().manual_seed(1)) - 0.5
+    ring.brdf_net = SharpenedMaterial.of(ring.brdf_net, grid)
+    write_state(ring_state(ring), tmp_path / "ring.pt")
+    options = {"type": "shapenet", "weights": str(tmp_path / "ring.pt"), "subdivisions": 4, "flash": False}
+    shape = mi.load_dict(options | {"bsdf": {"type": "cooktorrance"}})
+    (texture,) = fine_textures(shape.bsdf())
+    assert texture.divisions == divisions_for(*ring.domain.sample(4), 0.1)
+    values = np.array(texture.factors).reshape(len(triangles(shape)[1]), -1, 3)
+    points, faces = ring.domain.sample(4)
+    with torch.no_grad():
+        np.testing.assert_allclose(values[:, 0], ring.brdf_net.texture(points)[faces[:, 0]], rtol=1e-4)
+
+    pose = np.array(mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 1, 0]).matrix)
+    focal = SIZE / 2 / np.tan(np.radians(20))
+    camera = Camera(pose, np.full(2, focal), np.full(2, SIZE / 2), (SIZE, SIZE))
+    light = Light("point", np.array([2.0, 2, 3]), np.full(3, 20.0))
+    expected = ring.render(camera, light, spp=256).detach().numpy()
+    fine = picture(shape, 256)
+    ring.brdf_net = ring.brdf_net.base
+    smooth = ring.render(camera, light, spp=256).detach().numpy()
+    lit = smooth > 0.2 * smooth.max()
+    assert np.abs(fine - expected)[lit].mean() < 0.02 * smooth[lit].mean()
+    assert np.abs(smooth - expected)[lit].mean() > 0.08 * smooth[lit].mean()
+
+
+def test_there_are_as_many_points_as_the_detail_needs_and_memory_allows(monkeypatch):
+    """An icosahedron in the unit sphere has edges of 1.0515."""
+    points, faces = triangles(sphere(KINDS["cooktorrance"], 0))
+    assert divisions_for(points, faces, 0.1) == 11
+    assert divisions_for(points, faces, 5.0) == 1
+    monkeypatch.setattr("mi_ring.scene.mesh_texture.MOST", 200)  # for 20 triangles
+    n = divisions_for(points, faces, 0.1)
+    assert 20 * (n + 1) * (n + 2) / 2 <= 200
+    assert n == 2
+
+
+def test_a_name_is_needed():
+    with pytest.raises(RuntimeError, match="name is missing"):
+        mi.load_dict({"type": "fine_attribute"})
