@@ -7,8 +7,8 @@ beside the scene file or in <scene name>/; --truth names another folder. Each fi
 
 Prints a Markdown table, one line per fit and one with the worst of several seeds in each column: errors of normals [°]
 and depth [% of the diagonal], silhouettes, PSNR [dB], time of the iterations and of the whole command, peak memory, and
-GFLOP/s, the speed of float32 products of 4096³ right after the fit. `mi-ring paper timing` prints the errors during a
-fit.
+GFLOP/s, the speed of float32 products of 4096³ right after the fit. A fit with details gets a second line with the
+errors of its networks alone. `mi-ring paper timing` prints the errors during a fit.
 
 Other benchmarks use the functions of this script.
 """
@@ -18,6 +18,7 @@ import datetime
 import json
 import math
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -78,11 +79,46 @@ def measure(scene: Path, out: Path, options: list[str], truth: Path) -> dict[str
     last = (out / "log.jsonl").read_text("utf-8").splitlines()[-1]
     memory = usage.ru_maxrss / 2**20  # KiB → GiB
     costs = dict(zip(COSTS, (json.loads(last)["seconds"], wall, memory, speed / 1e9)))
+    return evaluated(out, truth) | costs
+
+
+def evaluated(out: Path, truth: Path) -> dict[str, float]:
+    """The numbers of `mi-ring evaluate` for a results folder."""
     evaluate = [sys.executable, "-m", "mi_ring.evaluate", str(out), "--mesh", str(truth / "mesh.ply")]
     if (novel := truth / "scene.xml").is_file():
         evaluate += ["--novel", str(novel)]
     numbers = json.loads(subprocess.run(evaluate, check=True, stdout=subprocess.PIPE, text=True).stdout)
-    return {"psnr_novel": math.nan} | numbers | costs
+    return {"psnr_novel": math.nan} | numbers
+
+
+def networks_alone(out: Path) -> Path | None:
+    """Write a results folder with the networks of another one, without details. Returns it; None if there are none."""
+    import mi_ring
+    from mi_ring.nets.registry import architecture_of
+    from mi_ring.objects.detail import DetailedFlow
+    from mi_ring.objects.fitted_object import FittedObject
+    from mi_ring.objects.ring_file import ring_state
+    from mi_ring.output.ply import write_mesh
+    from mi_ring.system.files import write_state
+
+    ring = mi_ring.load_fit(out)
+    flow, material = ring.shape_net, ring.brdf_net
+    if isinstance(flow, DetailedFlow):
+        flow = flow.base.network
+    while "net" in architecture_of(material)["arguments"]:
+        material = getattr(material.base, "network", material.base)
+    if material is ring.brdf_net:
+        return None
+    level = json.loads((out / "config.json").read_text())["subdivisions"]
+    plain = FittedObject(ring.center, float(ring.radius), domain=ring.domain, bsdf=ring.bsdf, indirect=ring.indirect,
+                         subdivisions=level, networks=(flow, material), ground=ring.ground)  # fmt: skip
+    folder = out.with_name(f"{out.name}_networks")
+    folder.mkdir(exist_ok=True)
+    for name in ("scene.xml", "config.json"):
+        shutil.copy(out / name, folder)
+    write_state(ring_state(plain), folder / "ring.pt")
+    write_mesh(plain, level, folder / "mesh.ply")
+    return folder
 
 
 def table(heads, rows) -> str:
@@ -118,6 +154,9 @@ def main() -> None:
             rows.append([row[c] for c in (*COLUMNS, *COSTS)])
             results.append([label, *cells(rows[-1])])
             print(f"{label}: {', '.join(results[-1][1:])}", file=sys.stderr)  # a later failure does not lose it
+            if alone := networks_alone(out):
+                numbers = evaluated(alone, truth)
+                results.append([f"{label}, networks", *cells([numbers.get(c, math.nan) for c in (*COLUMNS, *COSTS)])])
         if len(rows) > 1:
             worst = [min(v) if c in HIGHER_IS_BETTER else max(v) for c, v in zip([*COLUMNS, *COSTS], zip(*rows))]
             results.append([f"**{name}, worst**", *cells(worst)])

@@ -8,7 +8,8 @@ are seen at less than 60°. Colours are compared after one scale per channel, in
 compared inside the object. A fit with a texture finer than its mesh gets a second column, with this texture.
 
 Prints a Markdown table with a column for each RUN, and then one line of JSON. The row "none" of a band is the error of
-a fit that has nothing in this band.
+a fit that has nothing in this band. The last column is the limit that the photographs' noise sets: the Cramér-Rao bound
+of normal and colour of each pixel of the surface, if camera, light and everything else were known.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import recorded
 from mi_ring.capture.loading import load_capture
+from mi_ring.colour_profiles import srgb_to_linear
 from mi_ring.geometry.camera import Camera
 from mi_ring.images import linear_to_srgb
 from mi_ring.objects.ring_file import load_fit
@@ -29,6 +31,7 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.mesh_texture import remove_texture
 from mi_ring.scene.shot import Shot
+from mi_ring.scene.visibility import MaskedCamera, Visibility
 
 # isort: split
 import cv2
@@ -46,6 +49,7 @@ SAMPLES = 2  #: rays per pixel and axis of a map
 MARGIN, FACING = 6, 0.5  #: of the region that is compared: from its border [px]; least cosine toward the camera
 STEEP = 0.06  #: least gradient of red / (red + blue) at the edge of a stroke [1/px]; grain has none
 ALONG = np.arange(-2, 6.01, 0.05)  #: of profiles across such edges [px]
+POINTS = 2000  #: of the surface, for the limit by noise
 VISIBLE = 0.02  #: least contrast at which an edge has a width [of the true contrast]
 
 
@@ -190,6 +194,48 @@ class Comparison:
         return {name: None if value is None else float(value) for name, value in found.items()}
 
 
+def noise_limit(capture: Capture, truth: Path, electrons: float) -> dict[str, float]:
+    """The least errors that noise allows, by the names of `Comparison.numbers`.
+
+    `truth`: mesh with diffuse colours. `electrons`: of a white pixel. Photographs have 8 bits.
+    """
+    params = mi.traverse(mi.load_dict({"type": "ply", "filename": str(truth)}))
+    vertices, normals, colours, faces = (
+        np.array(params[name]).reshape(-1, 3)
+        for name in ("vertex_positions", "vertex_normals", "vertex_diffuse", "faces")
+    )
+    seen_by = Visibility(vertices, faces, []).seen_by
+    some = np.random.default_rng(0).integers(len(vertices), size=POINTS)
+    points, normals, colours = (values[some].astype(float) for values in (vertices, normals, colours))
+    across = np.cross(normals, np.roll(normals, 1, 1))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    tangents = np.stack([across, np.cross(normals, across)], 1)
+    information = np.zeros((POINTS, 5, 5))
+    for shot in capture.shots:
+        seen = seen_by(MaskedCamera(shot.camera, None), points, normals)
+        away, light = shot.camera.position - points, shot.own_light
+        lit = light.vector - points
+        cosine = ((normals * lit).sum(1) / np.linalg.norm(lit, axis=1)).clip(1e-3)
+        value = colours / np.pi * light.rgb * (cosine / (lit**2).sum(1))[:, None]
+        step = np.gradient(srgb_to_linear(np.arange(256) / 255))[(255 * linear_to_srgb(value.clip(0, 1))).astype(int)]
+        noise = value / electrons + step**2 / 12
+        slope = np.einsum("nkc,nc->nk", tangents, lit) / (normals * lit).sum(1)[:, None]
+        # Of a value: by the logarithm of each colour, and by both slopes.
+        change = np.concatenate([np.broadcast_to(np.eye(3), (POINTS, 3, 3)), slope[:, None].repeat(3, 1)], 2)
+        pixels = seen * (normals * away).sum(1) / np.linalg.norm(away, axis=1)
+        information += np.einsum("n,nc,nci,ncj->nij", pixels, value**2 / noise, change, change)
+    told = np.linalg.eigvalsh(information)[:, 0] > 1e-6 * np.linalg.eigvalsh(information)[:, -1].max()
+    variances = np.diagonal(np.linalg.inv(information[told]), axis1=1, axis2=2)
+    bent = np.degrees(np.sqrt(np.median(variances[:, 3:].sum(1))))
+    coloured = 100 * np.sqrt(np.median(variances[:, :3].mean(1)))
+    white = np.random.default_rng(0).normal(size=(256, 256, 1)).astype(np.float32)
+    found = {}
+    for name, band in zip(BANDS, bands(white, np.ones(white.shape[:2], bool))):
+        found[f"normals {name}, error °"] = float(bent * band.std())
+        found[f"colour {name}, error %"] = float(coloured * band.std())
+    return found
+
+
 def novel_errors(maps: Maps, novel: Capture) -> dict[str, float]:
     """PSNR [dB] of predicted novel views inside the object, of all and of what is finer than `FINE` pixels."""
     squares = []
@@ -210,6 +256,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--electrons", type=float, default=10_000, help="of a white pixel, see detail_captures.py")
     options = parser.parse_args()
     truth = options.capture / "truth"
     exact = next(file for file in (options.capture / "exact.xml", options.capture / "scene.xml") if file.is_file())
@@ -227,6 +274,7 @@ def main() -> None:
         columns[run] = comparison.numbers()
         if maps.ring is not None and (truth / "scene.xml").is_file():
             columns[run] |= novel_errors(maps, load_capture(truth / "scene.xml"))
+    columns["limit by noise"] = noise_limit(capture, truth / "mesh.ply", options.electrons)
     names = dict.fromkeys(name for numbers in columns.values() for name in numbers)
     values = ((name, [numbers.get(name) for numbers in columns.values()]) for name in names)
     rows = [[name, *("-" if value is None else f"{value:.2f}" for value in row)] for name, row in values]
