@@ -20,12 +20,16 @@ from mi_ring.geometry import domain
 from mi_ring.output import results
 from mi_ring.system import cache, files, machine
 
+#: Details take ten iterations, of which the last three are on a finer mesh. Then a texture is found.
+DETAILED = [*SPHERE, "--no-indirect", "--refine", "power", "--lobes", "1", "--detail-share", "1.25"]
 
-@pytest.mark.parametrize(("table", "start", "stop"), [  # which is in the second stage
-    (False, [*QUICK, "--no-indirect"], 4), (True, SPHERE, 6),
+
+@pytest.mark.parametrize(("table", "start", "stop", "stage"), [
+    (False, [*QUICK, "--no-indirect"], 4, 1), (True, SPHERE, 6, 1),
+    (False, DETAILED, 8, 1), (False, DETAILED, 15, 2),  # the last iteration of a stage
 ])  # fmt: skip
 def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(
-    broken_capture, tmp_path, monkeypatch, table, start, stop
+    broken_capture, tmp_path, monkeypatch, table, start, stop, stage
 ):
     """Also with an empty cache folder, and with one that has the start surface of the other fit.
 
@@ -46,7 +50,9 @@ def test_deterministic_fits_are_equal_bit_by_bit_also_when_resumed(
         results.prepare_folder(tmp_path / "b", small_capture, interrupted.settings())
         keeper = session.Keeper(first, tmp_path / "b", lambda: None)
         session.train(first, keeper, lambda: first.iteration == stop, None)
-    assert stop < first.iterations and first.schedule.stage(stop - 1) is first.schedule.stages[1]
+    assert stop < first.iterations and first.schedule.stage(stop - 1) is first.schedule.stages[stage]
+    if start is DETAILED:
+        assert first.schedule.stages[stage].last == stop and first.schedule.stages[stage + 1].detail
     assert fit.main([*arguments, "--out", str(tmp_path / "b"), "--resume"]) == 0
 
     rings = [torch.load(tmp_path / name / "ring.pt")["networks"] for name in ("a", "b")]

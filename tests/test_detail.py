@@ -475,27 +475,33 @@ SMALL = Config(iterations=24, levels=(2,), widths=(32,), shares=(1.0,), detail_s
                subdivisions=3, domain="sphere", refine=("none",), indirect=False, lobes="1")  # fmt: skip
 
 
+STOPS = 24, 31, 32, 35  #: before the first stage for details, in it, before the second, in it
+
+
 @pytest.fixture(scope="module")
 def detailed(small_capture):
     with threads_of(1):
         fit = Fit(load_capture(small_capture), SMALL)
         states = {}
         for it in fit:
-            if it.number in (24, 31):
+            if it.number in STOPS:
                 states[it.number] = fit.state()
     return fit, states
 
 
-def test_a_fit_with_details_goes_on_where_it_stopped(detailed, small_capture):
+@pytest.mark.parametrize("number", STOPS)
+def test_a_fit_with_details_goes_on_where_it_stopped(detailed, small_capture, number):
     fit, states = detailed
-    for number, state in states.items():
-        with threads_of(1):
-            again = Fit(load_capture(small_capture), SMALL, state=state)
-            assert again.iteration == number
-            again.run()
-        found, expected = again.ring.state_dict(), fit.ring.state_dict()
-        assert found.keys() == expected.keys()
-        assert all(torch.equal(found[name], expected[name]) for name in found)
+    assert [stage.first for stage in fit.schedule.stages if stage.detail] == [24, 32]
+    with threads_of(1):
+        again = Fit(load_capture(small_capture), SMALL, state=states[number])
+        assert again.iteration == number
+        again.run()
+    found, expected = again.ring.state_dict(), fit.ring.state_dict()
+    assert found.keys() == expected.keys()
+    assert all(torch.equal(found[name], expected[name]) for name in found)
+    assert all(any(values.any() for values in net.grid.values) for net in (again.ring.shape_net, again.ring.brdf_net))
+    assert [{**entry, "seconds": 0} for entry in again.course.log] == [{**e, "seconds": 0} for e in fit.course.log]
 
 
 def test_the_networks_stay_as_they_were(detailed, small_capture):
