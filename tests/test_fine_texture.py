@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
 from helpers.matte_ball import MATTE, PALE, pale_ball, photographed, plain
 
 from mi_ring.capture.loading import load_capture
