@@ -4,8 +4,8 @@
 
 CAPTURE is a folder with scene.xml and truth/mesh.ply, whose flash is at the lens. The photographs are changed after
 rendering; interreflection is not changed with them. Every other photograph is one capture of the object, the others are
-a second one. Each is fitted twice: with `--refine light power ambient --diffuse lambert`, and with options that should
-cure the fault.
+a second one. Each is fitted twice: with `--refine light power ambient --diffuse lambert --lobes 1`, and with options
+that should cure the fault. The last rows change the fit, or the choice of photographs, instead of the photographs.
 
 Prints a Markdown table with machine and date: mean error of the normals against the truth (of both captures), and mean
 and median angle between the normals of both surfaces at the nearest points. The same command continues after an
@@ -42,7 +42,8 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-BEFORE = "--refine light power ambient --diffuse lambert"  #: without what real photographs asked for
+BEFORE = "--refine light power ambient --diffuse lambert --lobes 1"  #: without what real photographs asked for
+FLASHES = 12  #: points of an extended flash
 POINTS, NEAR = 40_000, 0.01  #: of each surface; pairs of points farther apart do not count [diagonal]
 
 
@@ -53,6 +54,7 @@ class Lens(NamedTuple):
     up: np.ndarray
     forward: np.ndarray
     facing: np.ndarray  #: (H, W) cosine between the surface's normal and the ray; 1 beside the object
+    lit: Callable[[np.ndarray], np.ndarray]  #: what `Scene.lit` returns for a flash (3,) in the camera's axes
     random: np.random.Generator
 
 
@@ -73,11 +75,44 @@ def varnished(values: np.ndarray, lens: Lens) -> np.ndarray:
     return values + 0.3 * np.exp(-tangent2 / 0.1**2)[..., None] * (lens.facing < 1)[..., None]
 
 
-def facing(mesh: mi.Scene, pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Cosines (H, W) between the normals of a mesh and rays (3, H, W) in a camera's axes; 1 where there is no mesh."""
-    along = np.tensordot(pose[:3, :3], rays, 1).reshape(3, -1).astype(np.float32)
-    si = mesh.ray_intersect(mi.Ray3f(mi.Point3f(*pose[:3, 3].tolist()), mi.Vector3f(*map(mi.Float, along))))
-    return np.where(np.array(si.is_valid()), np.abs(np.array(si.wi.z)), 1).reshape(rays.shape[1:])
+def extended(values: np.ndarray, lens: Lens) -> np.ndarray:
+    """Light of a flash that is a disc, whose radius is 4 % of its distance."""
+    angles = 2 * np.pi * np.arange(FLASHES) / FLASHES * 2.4
+    radii = 0.04 * np.sqrt((np.arange(FLASHES) + 0.5) / FLASHES)
+    places = np.stack([radii * np.cos(angles), radii * np.sin(angles), 0 * radii], 1)
+    point = lens.lit(np.zeros(3))
+    ratio = sum(lens.lit(place) for place in places) / FLASHES / np.maximum(point, 1e-9)
+    return values * np.where(point > 0, ratio.clip(0, 3), 1)[..., None]
+
+
+class Scene:
+    """A mesh as a camera sees it. `rays` (3, H, W): of the pixels, in the camera's axes."""
+
+    def __init__(self, mesh: mi.Scene, pose: np.ndarray, rays: np.ndarray) -> None:
+        along = np.tensordot(pose[:3, :3], rays, 1).reshape(3, -1).astype(np.float32)
+        ray = mi.Ray3f(mi.Point3f(*pose[:3, 3].tolist()), mi.Vector3f(*map(mi.Float, along)))
+        self.mesh, self.pose, self.size, self.si = mesh, pose, rays.shape[1:], mesh.ray_intersect(ray)
+        self.seen = np.array(self.si.is_valid())
+        self.distance = np.median(np.array(self.si.t)[self.seen])
+
+    def facing(self) -> np.ndarray:
+        """Cosines (H, W) between normals and rays; 1 where there is no mesh."""
+        return np.where(self.seen, np.abs(np.array(self.si.wi.z)), 1).reshape(self.size)
+
+    def lit(self, place: np.ndarray) -> np.ndarray:
+        """Light (H, W) that a plain glossy surface reflects to the camera, with shadows; 0 where there is no mesh.
+
+        `place` (3,): of the flash in the camera's axes, from the lens [distance of the surface].
+        """
+        flash = mi.Point3f(*(self.pose[:3, 3] + self.distance * self.pose[:3, :3] @ place).tolist())
+        bsdf = mi.load_dict({"type": "cooktorrance", "diffuse": 0.3, "specular": 0.05, "roughness": 0.3,
+                             "diffuse_roughness": 0.0})  # fmt: skip
+        squared = mi.Vector3f(flash - self.si.p)
+        squared = squared.x**2 + squared.y**2 + squared.z**2
+        wo = self.si.to_local((flash - self.si.p) / (squared**0.5))
+        value = bsdf.eval(mi.BSDFContext(), self.si, wo).x / squared
+        shadow = self.mesh.ray_test(self.si.spawn_ray_to(flash))
+        return np.where(self.seen & ~np.array(shadow), np.array(value), 0).reshape(self.size)
 
 
 def compressed(values: np.ndarray) -> np.ndarray:
@@ -107,6 +142,8 @@ class Suspect(NamedTuple):
     """A fault, and the options of a fit that should cure it."""
 
     cure: str = "--refine auto"
+    before: str = BEFORE
+    by_height: bool = False  #: one capture has the photographs from above, the other one those from below
     radiance: Callable[[np.ndarray, Lens], np.ndarray] = lambda values, lens: values  #: linear, (H, W, 3)
     encoded: Callable[[np.ndarray], np.ndarray] = lambda values: values
     mask: Callable[[np.ndarray], np.ndarray] = lambda mask: mask
@@ -126,6 +163,11 @@ SUSPECTS = {
     "JPEG": Suspect(encoded=compressed),
     "blocky masks": Suspect("--refine auto masks", mask=blocky),
     "poses": Suspect(pose=moved),
+    "extended flash": Suspect(radiance=extended),
+    "interreflection left out": Suspect(before="--refine auto --no-indirect"),
+    "regulariser × 4": Suspect(before="--refine auto --weights.velocity 4"),
+    "regulariser / 4": Suspect(before="--refine auto --weights.velocity 0.25"),
+    "other places": Suspect(by_height=True),
 }
 
 
@@ -146,7 +188,8 @@ def write(capture: Path, folder: Path, suspect: Suspect) -> Path:
         rays /= np.linalg.norm(rays, axis=0)
         matrix = sensor.find("transform/matrix")
         pose = np.array(matrix.get("value").split(), float).reshape(4, 4)
-        lens = Lens(*rays, facing(mesh, pose, rays), random)
+        shown = Scene(mesh, pose, rays)
+        lens = Lens(*rays, shown.facing(), shown.lit, random)
         values = suspect.encoded(linear_to_srgb(suspect.radiance(srgb_to_linear(values), lens).clip(0, 1)))
         silhouette = suspect.mask(np.asarray(Image.open(capture / mask.get("value")).convert("L")))
         for element, picture in ((name, (255 * values.clip(0, 1) + 0.5).astype(np.uint8)), (mask, silhouette)):
@@ -158,9 +201,20 @@ def write(capture: Path, folder: Path, suspect: Suspect) -> Path:
         point = sensor.find("emitter/point")  # the flash is at the lens
         for axis, value in zip("xyz", pose[:3, 3]):
             point.set(axis, str(value))
+    if suspect.by_height:  # so that every other photograph is from above
+        sensors = sorted(root.findall("sensor"), key=height_of)
+        for sensor in sensors:
+            root.remove(sensor)
+        below, above = sensors[: len(sensors) // 2], sensors[len(sensors) // 2 :]
+        root.extend(sensor for pair in zip(below, above) for sensor in pair)
     move_names(root, folder, folder)
     scene.write_bytes(ElementTree.tostring(root))
     return scene
+
+
+def height_of(sensor: ElementTree.Element) -> float:
+    """The camera's last coordinate."""
+    return float(sensor.find("transform/matrix").get("value").split()[11])
 
 
 def angles(one: Path, other: Path) -> np.ndarray:
@@ -205,12 +259,13 @@ def main() -> None:
     for name in arguments.only:
         suspect = SUSPECTS[name]
         scene = write(arguments.capture, arguments.out / arguments.capture.name / re.sub(r"\W+", "_", name), suspect)
-        cells = [measured(scene, truth, [*own.split(), *options]) for own in (BEFORE, suspect.cure)]
-        rows.append([name, cells[0], f"`{suspect.cure}`", cells[1]])
+        cells = [measured(scene, truth, [*own.split(), *options]) for own in (suspect.before, suspect.cure)]
+        rows.append([name, f"`{suspect.before}`".replace(f"`{BEFORE}`", ""), cells[0], f"`{suspect.cure}`", cells[1]])
         print(*rows[-1], file=sys.stderr, flush=True)
     speed = product_speed(4096, 4096, torch.float32) / 1e9
     print(f"{processor()}; {speed:.0f} GFLOP/s; {datetime.date.today()}; mi_ring.fit {' '.join(options)}\n")
-    print(table(["fault", f"`{BEFORE}`: error, apart", "cure", "error, apart"], rows))
+    print(f"First: fits with `{BEFORE}`, unless the table names other options.\n")
+    print(table(["fault", "options", "error, apart", "cure", "error, apart"], rows))
 
 
 if __name__ == "__main__":
