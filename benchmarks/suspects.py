@@ -165,8 +165,8 @@ SUSPECTS = {
     "poses": Suspect(pose=moved),
     "extended flash": Suspect(radiance=extended),
     "interreflection left out": Suspect(before="--refine auto --no-indirect"),
-    "regulariser × 4": Suspect(before="--refine auto --weights.velocity 4"),
-    "regulariser / 4": Suspect(before="--refine auto --weights.velocity 0.25"),
+    "regulariser × 4": Suspect(before="--refine auto --weights.velocity 0.04"),
+    "regulariser / 4": Suspect(before="--refine auto --weights.velocity 0.0025"),
     "other places": Suspect(by_height=True),
 }
 
