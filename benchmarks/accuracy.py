@@ -107,7 +107,7 @@ def networks_alone(out: Path) -> Path | None:
         flow = flow.base.network
     while "net" in architecture_of(material)["arguments"]:
         material = getattr(material.base, "network", material.base)
-    if material is ring.brdf_net:
+    if material is ring.brdf_net and flow is ring.shape_net:
         return None
     level = json.loads((out / "config.json").read_text())["subdivisions"]
     plain = FittedObject(ring.center, float(ring.radius), domain=ring.domain, bsdf=ring.bsdf, indirect=ring.indirect,

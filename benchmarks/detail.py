@@ -49,7 +49,7 @@ SAMPLES = 2  #: rays per pixel and axis of a map
 MARGIN, FACING = 6, 0.5  #: of the region that is compared: from its border [px]; least cosine toward the camera
 STEEP = 0.06  #: least gradient of red / (red + blue) at the edge of a stroke [1/px]; grain has none
 ALONG = np.arange(-2, 6.01, 0.05)  #: of profiles across such edges [px]
-POINTS = 2000  #: of the surface, for the limit by noise
+POINTS, DARK = 2000, 0.01  #: of the surface, for the limit by noise; least cosine between normal and light
 VISIBLE = 0.02  #: least contrast at which an edge has a width [of the true contrast]
 
 
@@ -81,7 +81,7 @@ class Maps:
             self.surface = Surface(capture.scene, capture.shape, self.ring)
             self.surface.show(self.ring, *self.ring.domain.sample(self.ring.subdivisions))
             if not textured:
-                remove_texture(self.surface.shape.bsdf())
+                remove_texture(self.surface.shape)
         else:
             self.scene = mi.load_dict({"type": "scene", "mesh": {"type": "ply", "filename": str(path)}})
 
@@ -214,14 +214,18 @@ def noise_limit(capture: Capture, truth: Path, electrons: float) -> dict[str, fl
     for shot in capture.shots:
         seen = seen_by(MaskedCamera(shot.camera, None), points, normals)
         away, light = shot.camera.position - points, shot.own_light
+        assert light.kind == "point"
         lit = light.vector - points
-        cosine = ((normals * lit).sum(1) / np.linalg.norm(lit, axis=1)).clip(1e-3)
+        cosine = (normals * lit).sum(1) / np.linalg.norm(lit, axis=1)
+        seen &= cosine > DARK
+        cosine = cosine.clip(DARK)
         value = colours / np.pi * light.rgb * (cosine / (lit**2).sum(1))[:, None]
         step = np.gradient(srgb_to_linear(np.arange(256) / 255))[(255 * linear_to_srgb(value.clip(0, 1))).astype(int)]
         noise = value / electrons + step**2 / 12
-        slope = np.einsum("nkc,nc->nk", tangents, lit) / (normals * lit).sum(1)[:, None]
+        slope = np.einsum("nkc,nc->nk", tangents, lit) / (cosine * np.linalg.norm(lit, axis=1))[:, None]
         # Of a value: by the logarithm of each colour, and by both slopes.
         change = np.concatenate([np.broadcast_to(np.eye(3), (POINTS, 3, 3)), slope[:, None].repeat(3, 1)], 2)
+        seen &= (value < 1).all(1)
         pixels = seen * (normals * away).sum(1) / np.linalg.norm(away, axis=1)
         information += np.einsum("n,nc,nci,ncj->nij", pixels, value**2 / noise, change, change)
     told = np.linalg.eigvalsh(information)[:, 0] > 1e-6 * np.linalg.eigvalsh(information)[:, -1].max()

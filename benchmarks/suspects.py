@@ -77,9 +77,10 @@ def varnished(values: np.ndarray, lens: Lens) -> np.ndarray:
 
 def extended(values: np.ndarray, lens: Lens) -> np.ndarray:
     """Light of a flash that is a disc, whose radius is 4 % of its distance."""
-    angles = 2 * np.pi * np.arange(FLASHES) / FLASHES * 2.4
+    angles = np.pi * (3 - 5**0.5) * np.arange(FLASHES)
     radii = 0.04 * np.sqrt((np.arange(FLASHES) + 0.5) / FLASHES)
     places = np.stack([radii * np.cos(angles), radii * np.sin(angles), 0 * radii], 1)
+    places -= places.mean(0)
     point = lens.lit(np.zeros(3))
     ratio = sum(lens.lit(place) for place in places) / FLASHES / np.maximum(point, 1e-9)
     return values * np.where(point > 0, ratio.clip(0, 3), 1)[..., None]
@@ -165,8 +166,8 @@ SUSPECTS = {
     "poses": Suspect(pose=moved),
     "extended flash": Suspect(radiance=extended),
     "interreflection left out": Suspect(before="--refine auto --no-indirect"),
-    "regulariser × 4": Suspect(before="--refine auto --weights.velocity 0.04"),
-    "regulariser / 4": Suspect(before="--refine auto --weights.velocity 0.0025"),
+    "four times the regulariser": Suspect(before="--refine auto --weights.velocity 0.04"),
+    "a quarter of the regulariser": Suspect(before="--refine auto --weights.velocity 0.0025"),
     "other places": Suspect(by_height=True),
 }
 
@@ -258,7 +259,9 @@ def main() -> None:
     rows, truth = [], arguments.capture / "truth/mesh.ply"
     for name in arguments.only:
         suspect = SUSPECTS[name]
-        scene = write(arguments.capture, arguments.out / arguments.capture.name / re.sub(r"\W+", "_", name), suspect)
+        changes = suspect._replace(before=BEFORE, cure=SUSPECTS["none"].cure) != SUSPECTS["none"]
+        folder = re.sub(r"\W+", "_", name if changes else "none")
+        scene = write(arguments.capture, arguments.out / arguments.capture.name / folder, suspect)
         cells = [measured(scene, truth, [*own.split(), *options]) for own in (suspect.before, suspect.cure)]
         rows.append([name, f"`{suspect.before}`".replace(f"`{BEFORE}`", ""), cells[0], f"`{suspect.cure}`", cells[1]])
         print(*rows[-1], file=sys.stderr, flush=True)

@@ -81,7 +81,7 @@ def test_pictures_and_maps_show_it(sharp, print_scene):
     surface.show(sharp, *sharp.domain.sample(5))
     pictures = [prediction.draw(surface, capture.photograph(0))[0][0].numpy() for _ in range(2)]
     diffuse = prediction.maps(surface, capture.photograph(0))["diffuse"][0]
-    remove_texture(surface.shape.bsdf())
+    remove_texture(surface.shape)
     plain = prediction.draw(surface, capture.photograph(0))[0][0].numpy()
     seen = capture.observe([0]).rgb[0].numpy()
     inside = plain.min(-1) > 0.1 * np.quantile(plain, 0.9)
@@ -173,7 +173,7 @@ def test_it_does_not_change_highlights(sharp, print_scene):
         last.copy_(torch.tensor([-30.0, -30.0, -30.0, 0.0, 0.0]))
     surface.show(ring, *ring.domain.sample(5))
     pictures = [prediction.draw(surface, capture.photograph(0))[0][0].numpy() for _ in range(2)]
-    remove_texture(surface.shape.bsdf())
+    remove_texture(surface.shape)
     plain = prediction.draw(surface, capture.photograph(0))[0][0].numpy()
     assert plain.max() > 0.1
     for picture in pictures:  # the second shows that the first has brought the highlights back
@@ -333,6 +333,35 @@ def test_what_disagrees_is_trusted_less():
         for part in np.array_split(triangles, 3):
             comparison.add(k, part, found[part], np.ones((len(part), 1)))
     assert comparison.trust().tolist() == pytest.approx([1, 1, 1, 0.01, 1, 1])
+
+
+def test_a_label_and_a_sharp_minority_are_no_reason_to_doubt():
+    """Photographs that see a print differ more than those that see none. If most are blurred, the sharp ones differ."""
+    sphere = trimesh.creation.icosphere(5)
+    points, rng = Points.of(sphere.faces, 1), np.random.default_rng(2)
+    centres, count = sphere.triangles_center, 24
+    printed = centres[:, 2] > 0.5
+    labelled, sharp = (Comparison(points, sphere.vertices, count) for _ in range(2))
+    true = rng.normal(size=(len(sphere.faces), 1, 3))
+    for k in range(count):
+        toward = rng.normal(size=3)
+        shown = np.flatnonzero(centres @ toward / np.linalg.norm(toward) > 0.3)
+        noise = rng.normal(size=(len(shown), 1, 3))
+        error = np.where(printed[shown, None, None], 0.2, 0.015)
+        labelled.add(k, shown, true[shown] * printed[shown, None, None] + error * noise, np.ones((len(shown), 1)))
+        contrast = 1.0 if k < 4 else 0.3
+        sharp.add(k, shown, contrast * true[shown] + 0.05 * noise, np.ones((len(shown), 1)))
+    assert labelled.trust().min() > 0.6
+    assert sharp.trust()[:4].tolist() == [1, 1, 1, 1]
+
+
+def test_equal_photographs_are_trusted(recwarn):
+    sphere = trimesh.creation.icosphere(3)
+    comparison, everywhere = Comparison(Points.of(sphere.faces, 1), sphere.vertices, 4), np.arange(len(sphere.faces))
+    for k in range(4):
+        comparison.add(k, everywhere, np.ones((len(everywhere), 1, 3)), np.ones((len(everywhere), 1)))
+    assert comparison.trust().tolist() == [1, 1, 1, 1]
+    assert not recwarn
 
 
 def test_what_cannot_be_compared_is_trusted():

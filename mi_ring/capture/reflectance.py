@@ -8,7 +8,7 @@ import numpy as np
 from mi_ring.capture.capture import Capture
 from mi_ring.capture.scenefile import bsdf_element
 from mi_ring.errors import InputError
-from mi_ring.nets.brdf_net import COAT, COOK_TORRANCE, ROUGH, Parameter, albedo_of
+from mi_ring.nets.brdf_net import COAT, COOK_TORRANCE, ROUGH, Parameter
 from mi_ring.scene.mesh_attributes import attributes_of, constant_values, optional_of
 from mi_ring.scene.xml_elements import load_bsdf
 
@@ -64,8 +64,7 @@ def predicted_parameters(
                              f"{low:g} to {high:g}")  # fmt: skip
         parameters.append(Parameter(name, 3 if value.size == 3 else 1, low, high, initial_output(value, low, high)))
         texture.clear()
-        kind = "fine_attribute" if albedo_of(parameters[-1:]) else "mesh_attribute"
-        texture.tag, texture.attrib = "texture", {"name": name, "type": kind}
+        texture.tag, texture.attrib = "texture", {"name": name, "type": "mesh_attribute"}
         ElementTree.SubElement(texture, "string", name="name", value=f"vertex_{name}")
     xml = ElementTree.tostring(element, "unicode")
     try:

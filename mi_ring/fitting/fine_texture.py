@@ -25,7 +25,6 @@ from mi_ring.fitting.surface_ratios import Comparison, Points, Ratios, bilinear
 from mi_ring.geometry.camera import pixels_per_unit
 from mi_ring.geometry.hull import evenly_spaced
 from mi_ring.geometry.meshes import area_of
-from mi_ring.nets.brdf_net import albedo_of
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.rendering import prediction
@@ -33,6 +32,7 @@ from mi_ring.rendering.photographs import Photographs
 from mi_ring.rendering.surface import Surface
 from mi_ring.scene.shot import Shot, Window
 from mi_ring.scene.visibility import MaskedCamera, Visibility
+from mi_ring.scene.xml_elements import with_fine_attribute
 from mi_ring.system.machine import pipelined, release_memory
 from mi_ring.system.progress import progress
 
@@ -68,7 +68,10 @@ def texture_width(given: Capture, index: Sequence[int]) -> int:
 
 
 def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray) -> float:
-    """Estimate how long `sharpened` takes [s] on two cores. The arguments are those of `chosen_photographs`."""
+    """Estimate how long `sharpened` takes [s] on two cores, if it reads no photograph twice.
+
+    The arguments are those of `chosen_photographs`.
+    """
     return sum(0.5 + 4e-8 * math.prod(given.shots[k].whole.size) for k in chosen_photographs(given, fitted))
 
 
@@ -185,8 +188,8 @@ def sharpened(
     the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
     index = chosen_photographs(before, fitted)
-    widest = texture_width(before, index)
-    if not widest or not albedo_of(ring.brdf_net.bsdf_parameters):
+    widest, albedo = texture_width(before, index), ring.brdf_net.albedo
+    if not widest or not albedo:
         return ring
     predictor = Predictor(surface, ring, refined)
     vertices, normals, faces = predictor.vertices, predictor.normals, predictor.faces
@@ -214,10 +217,11 @@ def sharpened(
         photograph, (pixels, _) = with_usable_pixels(enlarged(before, k, *shots[k])), camera.project(vertices)
         number, parts = index.index(k), 1 + len(triangles) * len(ratios.points.shares) // AT_ONCE
         again = trust[number] < 1
+        factor = trust[number] - again  # negative the second time: what was too much is taken out
         for part in np.array_split(triangles, parts):
             logarithms, usable = ratios_of(expected, photograph, ratios.points, part, pixels)
             weight = usable * ratios.points.at(weights[:, None], part)[..., 0]
-            ratios.add(number % 2, part, logarithms, weight * (trust[number] - again))
+            ratios.add(number % 2, part, logarithms, weight * factor)
             if not again:
                 comparison.add(number, part, logarithms, weight)
 
@@ -225,7 +229,7 @@ def sharpened(
         pass
     trust = comparison.trust()
     doubtful = [k for k, share in zip(index, trust) if share < 1]
-    for _ in progress(pipelined(predicted, compare, doubtful), "texture without what disagrees", len(doubtful)):
+    for _ in progress(pipelined(predicted, compare, doubtful), "texture: photographs that disagree", len(doubtful)):
         pass
     own = [at_width(before.shots[k], refined.shots[k], min(width, widest))[1].camera for k in index]
     coarser = resolution / pixels_per_unit(own, ring.center.cpu().numpy())
@@ -233,8 +237,9 @@ def sharpened(
     grid = ratios.texture(predictor.s, coarse / scale, fine / scale)
     if grid is None:
         return ring
+    bsdf = with_fine_attribute(ring.bsdf, albedo.attribute)
     return FittedObject(
-        ring.center, float(ring.radius), domain=ring.domain, bsdf=ring.bsdf, indirect=ring.indirect, up=ring.up,
+        ring.center, float(ring.radius), domain=ring.domain, bsdf=bsdf, indirect=ring.indirect, up=ring.up,
         subdivisions=ring.subdivisions, ground=ring.ground, metres=ring.metres,
         networks=(ring.shape_net, SharpenedMaterial.of(ring.brdf_net, grid)),
     ).to(ring.center.device)  # fmt: skip

@@ -14,7 +14,8 @@ SOLVING = 4  #: steps to find the values of the corners of a grid
 CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have in common
 PATCHES, PATCH = 300, 64  #: places at which photographs are compared with each other, and number of points of each
 FEWEST, LEAST = 3, 0.01  #: number of photographs that are compared with each other; least weight of one
-USUAL = 2.0  #: mean squares of differences up to this multiple of their median say nothing against a photograph
+USUAL = 2.0  #: variances up to this multiple of their median are usual
+FLAT = 1e-3  #: smaller differences of logarithms are nothing
 
 
 class Points(NamedTuple):
@@ -139,12 +140,12 @@ class Comparison:
         centres = s[points.faces].mean(1)
         some = np.linspace(0, len(centres) - 1, min(PATCHES, len(centres))).astype(int)
         near = cKDTree(centres).query(centres[some], min(PATCH, len(centres)))[1]
-        self.triangles = near.reshape(len(some), -1)  #: (patches, points)
+        self.triangles, self.number = near.reshape(len(some), -1), len(centres)  #: (patches, points); of triangles
         self.ratios = np.full((count, *self.triangles.shape, 3), np.nan, np.float32)
 
     def add(self, photograph: int, triangles: np.ndarray, logarithms: np.ndarray, weights: np.ndarray) -> None:
         """Add what a photograph shows. `triangles` (f,): indices. `logarithms` (f, n, 3). `weights` (f, n)."""
-        place = np.full(self.triangles.max() + 1 + triangles.max(initial=0), -1)
+        place = np.full(self.number, -1)
         place[triangles] = np.arange(len(triangles))
         here = place[self.triangles]
         shown = (here >= 0) & (weights[here, 0] > 0 if len(weights) else False)
@@ -153,7 +154,10 @@ class Comparison:
     def trust(self) -> np.ndarray:
         """Return weights (count,) of the photographs: 1, or down to `LEAST` if one differs from the median of all.
 
-        Of each patch, only differences from its mean count: light and shape of the fit are not exact.
+        Of each patch, only differences from its mean count: light and shape of the fit are not exact. They are divided
+        by what is usual in this patch, since photographs show different ones. A photograph may have more or less
+        contrast than the median, which is blurred if most photographs are: what counts is the rest, relative to the
+        photograph's own contrast.
         """
         seen = np.isfinite(self.ratios[..., 0])
         seen &= seen.sum(2, keepdims=True) >= self.triangles.shape[1] / 2
@@ -162,7 +166,16 @@ class Comparison:
             warnings.simplefilter("ignore", RuntimeWarning)  # some patches are seen by no photograph
             fine = np.where(seen[..., None], self.ratios, np.nan)
             fine -= np.nanmean(fine, 2, keepdims=True)
-            squares = np.nanmean(np.square(fine - np.nanmedian(fine, 0)), (1, 2, 3))
-            usual = USUAL * np.nanmedian(squares)
-        excess = np.where(squares > usual, squares / usual, 1.0)  # 1 where nothing can be compared
+            median = np.nanmedian(fine, 0)
+            differences = np.nanmean(np.square(fine - median), (2, 3))
+            scale = np.sqrt(np.maximum(np.nanmedian(differences, 0), FLAT**2))[:, None, None]
+            fine, median = fine / scale, np.broadcast_to(median / scale, fine.shape)
+            contrast = np.nansum(fine * median, (1, 2, 3)) / np.nansum(
+                np.where(seen[..., None], median, 0) ** 2, (1, 2, 3)
+            )
+            contrast = np.clip(np.nan_to_num(contrast, nan=1.0), 1e-3, None)
+            rest = fine - contrast[:, None, None, None] * median
+            variance = np.nanmean(np.square(rest), (1, 2, 3)) / contrast**2
+            usual = np.maximum(USUAL * np.nanmedian(variance), FLAT)
+        excess = np.where(variance > usual, variance / usual, 1.0)  # 1 where nothing can be compared
         return np.maximum(excess**-2, LEAST)

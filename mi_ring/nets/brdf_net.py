@@ -22,6 +22,11 @@ class Parameter(NamedTuple):
     high: float  #: inf: no upper limit
     start: float = 0.0  #: added to the network's output before that is mapped to the range
 
+    @property
+    def attribute(self) -> str:
+        """Name of the mesh attribute that has the parameter's values."""
+        return f"vertex_{self.name}"
+
 
 ALBEDO = "diffuse", "reflectance", "diffuse_reflectance", "base_color"  #: Mitsuba's names of the colour without gloss
 #: Mitsuba's names of the strength of highlights, and of their width
@@ -68,6 +73,11 @@ class MaterialNet(nn.Module):
         self.scale.fill_(scale)
 
     @property
+    def albedo(self) -> Parameter | None:
+        """The parameter that is the albedo. None if there is none."""
+        return albedo_of(self.bsdf_parameters)
+
+    @property
     def outputs(self) -> int:
         """Number of values that `evaluate` must return per point: one or three for each parameter."""
         return sum(p.channels for p in self.bsdf_parameters)
@@ -96,7 +106,8 @@ class MaterialNet(nn.Module):
     def texture(self, s: Tensor) -> Tensor | None:
         """Compute factors (..., 3) of the albedo at domain points (..., 3). Returns None if there is no texture.
 
-        `forward` leaves it out, because it is too fine for the vertices of a mesh.
+        `forward` leaves it out, because it is too fine for the vertices of a mesh. A class with a texture must also
+        have a method `texture_cell`.
         """
         return None
 
@@ -106,7 +117,7 @@ class MaterialNet(nn.Module):
 
     def fine(self, s: Tensor) -> dict[str, Tensor]:
         """Compute the parameters, with the texture, at domain points (..., 3)."""
-        values, factors, colour = self(s), self.texture(s), albedo_of(self.bsdf_parameters)
+        values, factors, colour = self(s), self.texture(s), self.albedo
         if factors is None or not colour:
             return values
         return values | {colour.name: (values[colour.name] * factors).clamp(colour.low, colour.high)}

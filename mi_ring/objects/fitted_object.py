@@ -90,7 +90,8 @@ class FittedObject(nn.Module):
 
         `light`: None: a point light of intensity 1 at the camera. `spp`: samples per pixel. `level`: level of the mesh;
         None: the object's `subdivisions`. `shadows`: the object casts shadows on itself. One backward pass from the
-        picture to the parameters of both networks is possible. Its gradients include moving outlines and shadows.
+        picture to the parameters of both networks is possible. Its gradients include moving outlines and shadows. A
+        texture finer than the mesh is in the picture, but gets no gradient.
 
         Raises InputError if camera or light is invalid, and for numbers out of range.
         """
@@ -107,7 +108,7 @@ class FittedObject(nn.Module):
         surface = Surface(assembled([shape]), shape, self)
         s, faces = self.domain.sample(level)
         surface.set_faces(faces)
-        write_texture(surface.shape.bsdf(), self.brdf_net, s, faces)
+        write_texture(surface.shape, self.brdf_net, s, faces)
         vertices, material = self(s.to(self.center.device))
         return prediction.render(surface, view, vertices, material, spp, seed, shadows)[0][0]
 

@@ -95,7 +95,7 @@ class TransferredMaterial(MaterialNet):
         return self.net.texture(self.corresponding(s))
 
     def texture_cell(self) -> float | None:
-        return self.net.texture_cell()  # domains are about equally large
+        return self.net.texture_cell()  # about: domains are equally large, but the map between them stretches
 
     def corresponding(self, s: Tensor) -> Tensor:
         """Return the points (..., 3) of the other domain that correspond to points (..., 3) of this one."""

@@ -45,7 +45,9 @@ class SharpenedMaterial(MaterialNet):
         return self.base(s)
 
     def texture(self, s: Tensor) -> Tensor:
-        return torch.exp(self.grid(s.reshape(-1, 3)).reshape(s.shape))
+        factors = torch.exp(self.grid(s.reshape(-1, 3)).reshape(s.shape))
+        self.grid.latest.clear()  # the weights take more memory than a texture of the same points
+        return factors
 
     def texture_cell(self) -> float:
         return self.grid.cells[-1]

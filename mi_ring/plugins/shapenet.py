@@ -154,7 +154,7 @@ class ShapeNetMesh(mi.Mesh):
         for name, value in material.items():
             self.add_attribute(f"vertex_{name}", value[0].numel(), value.contiguous().numpy().ravel())
         if self.ring is not None:
-            write_texture(self.bsdf(), self.ring.brdf_net, s, faces)
+            write_texture(self, self.ring.brdf_net, s, faces)
         require_attributes(self)
 
     def to_string(self):

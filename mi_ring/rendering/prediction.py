@@ -102,7 +102,7 @@ def draw(
     Returns CPU tensors: (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). `photographs`: which photographs
     to render, and at what size. `spp`: samples per pixel. `shadows`: the photographs' own lights cast shadows.
     `indirect`: add interreflection, rendered with `paths` paths per pixel in a picture that is at most 128 pixels wide.
-    The light of the room in `photographs` is always added. So is the texture of a surface that `show` has written.
+    The light of the room in `photographs` is always added. A texture that `show` has written is in the picture.
     `occlusion`: True: the surface blocks a part of the room light; False: only of its lobes, which is faster.
 
     However many pixels and samples there are, this needs about a gigabyte of memory besides the pictures. `indirect` or
@@ -140,7 +140,7 @@ def maps(
 ) -> dict[str, np.ndarray]:
     """Render normals and BSDF parameters at pixel centres of N photographs, for the surface as it was last written.
 
-    The texture of a surface that `show` has written is in its colours.
+    A texture that `show` has written is in the colours, at the centres of pixels like all else.
 
     Returns NumPy arrays by name: `normal` (N, H, W, 3) in world space, and each of `parameters`, (N, H, W, 3) or (N, H,
     W). Pixels without a surface are 0.

@@ -51,9 +51,13 @@ class Surface:
         self.written = 0  #: number of times that vertices were written
 
     def set_faces(self, faces: np.ndarray) -> None:
-        """Set other triangles (F, 3). Vertices and attributes must be written again before the next rendering."""
+        """Set other triangles (F, 3). Vertices and attributes must be written again before the next rendering.
+
+        If they are others, the texture is removed.
+        """
         if faces is not self.faces:
             self.faces, self.faces_changed = faces, True
+            remove_texture(self.shape)  # it is for other triangles
 
     def parameters(self, vertices: Tensor, attributes: dict[str, Tensor]) -> dict[str, Tensor]:
         """Convert tensors to the parameters of the mesh. Writes nothing.
@@ -74,12 +78,12 @@ class Surface:
         return {POSITIONS: vertices / self.unit} | {f"vertex_{name}": value for name, value in attributes.items()}
 
     def write(self, vertices: Tensor, attributes: dict[str, Tensor]) -> None:
-        """Write vertices and attributes to the mesh, without gradients.
+        """Write vertices and attributes to the mesh, without gradients. A texture that it had is removed.
 
         `vertices` (V, 3) [scene units]. `attributes`: (V, 3) or (V,) by name. Raises ValueError if V is not the number
         of vertices that the triangles need, or if an attribute has another size.
         """
-        remove_texture(self.shape.bsdf())  # it is of another object
+        remove_texture(self.shape)  # it is of another object
         self.write_arrays({name: to_drjit(t) for name, t in self.parameters(vertices, attributes).items()})
 
     def write_arrays(self, arrays: dict[str, mi.Float]) -> None:
@@ -108,7 +112,7 @@ class Surface:
         move_lamps(self.scene, places, strengths)
 
     def show(self, ring: RenderedObject, s: Tensor, faces: np.ndarray, time: float = 1.0) -> None:
-        """Evaluate a fitted object at points `s` (V, 3) of its domain, and write surface and material to the mesh.
+        """Evaluate a fitted object at points `s` (V, 3) of its domain. Write surface, material and texture to the mesh.
 
         `faces` (F, 3): triangles of the points. `time`: state of the deformation, from 0 (start surface) to 1 (fitted
         object).
@@ -116,7 +120,7 @@ class Surface:
         with torch.no_grad():
             self.set_faces(faces)
             self.write(*ring(s.to(ring.center.device), time))
-            write_texture(self.shape.bsdf(), ring.brdf_net, s, faces)
+            write_texture(self.shape, ring.brdf_net, s, faces)
 
 
 def unit_for(radius: float) -> float:

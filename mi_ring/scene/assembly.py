@@ -10,7 +10,7 @@ import numpy as np
 from mi_ring.scene.alignment import to_flat
 from mi_ring.scene.lights import LAMP_CLASSES, Light, emitter_of, light_of, move_lamp
 from mi_ring.scene.mesh_attributes import require_attributes
-from mi_ring.scene.xml_elements import load_bsdf
+from mi_ring.scene.xml_elements import load_bsdf, with_fine_attribute
 
 MAX_EXTENT = 4.0  #: radius of a ball that contains the object during a fit [radius of the normalising sphere]
 
@@ -123,7 +123,8 @@ def with_fitted_shape(
         if not new.has_attribute(f"vertex_{parameter.name}"):
             values = np.zeros(new.vertex_count() * parameter.channels, np.float32)
             new.add_attribute(f"vertex_{parameter.name}", parameter.channels, values)
-    new.set_bsdf(load_bsdf(ring.bsdf))
+    albedo = ring.brdf_net.albedo
+    new.set_bsdf(load_bsdf(with_fine_attribute(ring.bsdf, albedo.attribute) if albedo else ring.bsdf))
     require_attributes(new)
     params = mi.traverse(new)
     points = np.array(params["vertex_positions"]).reshape(-1, 3)

@@ -51,7 +51,7 @@ def attribute_of(texture) -> str | None:
 
 def is_fine(texture) -> bool:
     """Return True if a texture is a `fine_attribute`, in any variant of Mitsuba."""
-    return hasattr(texture, "set_factors")
+    return hasattr(texture, "set_lattice")
 
 
 def fine_textures(bsdf) -> list:

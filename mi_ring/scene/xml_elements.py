@@ -30,3 +30,13 @@ def load_bsdf(xml: str) -> mi.BSDF:
         return load_element(ElementTree.fromstring(xml))
     except (ElementTree.ParseError, RuntimeError) as error:
         raise InputError(f"bsdf: {' '.join(str(error).split())}") from error
+
+
+def with_fine_attribute(xml: str, attribute: str) -> str:
+    """Let a BSDF read a mesh attribute by `fine_attribute` instead of `mesh_attribute`. `xml`: a <bsdf> element."""
+    element = ElementTree.fromstring(xml)
+    found = [texture for texture in element.iter("texture") if texture.get("type") == "mesh_attribute"
+             and texture.find(f"string[@name='name'][@value='{attribute}']") is not None]  # fmt: skip
+    for texture in found:
+        texture.set("type", "fine_attribute")
+    return ElementTree.tostring(element, "unicode") if found else xml
