@@ -17,8 +17,8 @@ from mi_ring.images import linear_to_srgb, to_bytes
 from mi_ring.rendering import prediction
 
 SHOWN = "01", "09", "17", "25", "33", "42", "50", "58"  #: photographs that show each step
-HELD_OUT = "05", "29", "53"  #: photographs that the fit has not seen, beside what it predicts
-WIDTH = 300  #: of each [px]
+HELD_OUT = "05", "29", "61"  #: photographs that the fit has not seen, beside what it predicts
+WIDTH, RESULT_WIDTH = 300, 400  #: of each, and of those beside predictions [px]
 
 
 def table(pictures: list[np.ndarray]) -> np.ndarray:
@@ -77,21 +77,32 @@ def results(out: Path) -> np.ndarray:
     rows = []
     for name in HELD_OUT:
         k = next(k for k, shot in enumerate(capture.shots) if shot.name == name)
-        scale = -(-capture.shots[k].size[0] // WIDTH)
-        photograph = capture.photograph(k, scale)
+        photograph = capture.photograph(k)
         maps = {what: values[0] for what, values in prediction.maps(surface, photograph).items()}
-        rgb, coverage = prediction.draw(surface, photograph, spp=64, indirect=ring.indirect)
+        rgb, coverage = prediction.draw(surface, photograph, indirect=ring.indirect)
         seen = coverage[0].numpy()[..., None] > 0.5
         diffuse = maps["diffuse"] / np.quantile(maps["diffuse"][seen[..., 0]], 0.99)
-        observed = linear_to_srgb(capture.observe([k], scale).rgb[0].numpy())
+        observed = linear_to_srgb(capture.observe([k]).rgb[0].numpy())
         predicted = linear_to_srgb(rgb[0].numpy())
-        rows.append(labelled({
-            f"photograph {name}": observed, "prediction": predicted,
+        pictures = {
+            f"photograph {name}": observed,
+            "prediction": predicted,
             "4 x difference": np.where(seen, 4 * np.abs(predicted - observed), 0),
             "normals": np.where(seen, maps["normal"] * 0.5 + 0.5, 0),
             "diffuse": linear_to_srgb(np.where(seen, diffuse, 0)),
-        }))  # fmt: skip
+        }
+        rows.append(labelled({what: around(picture, seen[..., 0]) for what, picture in pictures.items()}))
     return np.concatenate(rows)
+
+
+def around(picture: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """The part (H, W, 3) of a picture around an object, as wide as all others. `inside` (H, W): the object's pixels."""
+    rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
+    half = 0.52 * max(np.ptp(rows), np.ptp(columns))
+    middle = np.array([columns[[0, -1]].mean(), rows[[0, -1]].mean()])
+    to_result = RESULT_WIDTH / (2 * half) * np.column_stack([np.eye(2), half - middle])
+    size = RESULT_WIDTH, RESULT_WIDTH
+    return cv2.warpAffine(picture.astype(np.float32), to_result, size, flags=cv2.INTER_AREA).clip(0, 1)
 
 
 def main() -> None:
