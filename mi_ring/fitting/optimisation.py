@@ -116,6 +116,7 @@ class Optimisation:
             self.steppers = detail_steppers(model.ring, config)
         else:
             self.steppers = network_steppers(model.ring, config, self.problem.device)
+        # Details do not improve poses: with cameras off by half a pixel, novel views were 0.1 dB worse, not better.
         if (calibration := model.calibration) and not model.detailed:
             self.solvers += [ExposureSolver(calibration, n) for n in ("power", "gain") if n in calibration.refined]
             if {"falloff", "contrast"} & {*calibration.refined}:
