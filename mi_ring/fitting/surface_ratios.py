@@ -169,10 +169,8 @@ class Comparison:
             median = np.nanmedian(fine, 0)
             differences = np.nanmean(np.square(fine - median), (2, 3))
             scale = np.sqrt(np.maximum(np.nanmedian(differences, 0), FLAT**2))[:, None, None]
-            fine, median = fine / scale, np.broadcast_to(median / scale, fine.shape)
-            contrast = np.nansum(fine * median, (1, 2, 3)) / np.nansum(
-                np.where(seen[..., None], median, 0) ** 2, (1, 2, 3)
-            )
+            fine, median = fine / scale, np.where(seen[..., None], median / scale, np.nan)
+            contrast = np.nansum(fine * median, (1, 2, 3)) / np.nansum(median**2, (1, 2, 3))
             contrast = np.clip(np.nan_to_num(contrast, nan=1.0), 1e-3, None)
             rest = fine - contrast[:, None, None, None] * median
             variance = np.nanmean(np.square(rest), (1, 2, 3)) / contrast**2
