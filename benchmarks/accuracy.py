@@ -116,6 +116,8 @@ def networks_alone(out: Path) -> Path | None:
     folder.mkdir(exist_ok=True)
     for name in ("scene.xml", "config.json"):
         shutil.copy(out / name, folder)
+    if (out / "masks").is_dir():
+        shutil.copytree(out / "masks", folder / "masks", dirs_exist_ok=True)
     write_state(ring_state(plain), folder / "ring.pt")
     write_mesh(plain, level, folder / "mesh.ply")
     return folder

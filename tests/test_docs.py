@@ -247,7 +247,7 @@ def values(tmp_path):
         "merl": [{"filename": str(networks), "material": "one"}],
         "table": [{"to_world": moved, "bsdf": {"type": "diffuse", "reflectance": grey}}],
         "photometric": [{"shadows": False}],
-        "fine_attribute": [{"name": "vertex_colour"}],
+        "fine_attribute": [{"name": "vertex_colour", "scale": 2.0}],
     }  # fmt: skip
 
 

@@ -224,6 +224,8 @@ def test_shapes_that_share_a_bsdf_have_their_own_textures():
     (texture,) = fine_textures(a.bsdf())
     colours = np.array(texture.eval_3(scene.ray_intersect(ray), mi.Bool(True)))
     np.testing.assert_allclose(colours, np.tile([0.25, 0.75, 0.5], (3, 1)), rtol=1e-5)
+    names = {name.rpartition(".")[2] for name, _ in mi.traverse(scene) if "factors" in name}
+    assert names == {"factors_a", "factors_b"}
     write_texture(a, MaterialNet(), *triangles(a))
     colours = np.array(texture.eval_3(scene.ray_intersect(ray), mi.Bool(True)))
     np.testing.assert_allclose(colours, np.tile([0.5, 0.75, 0.5], (3, 1)), rtol=1e-5)
@@ -270,6 +272,9 @@ def test_a_texture_is_computed_once_for_many_pictures(textured, monkeypatch):
     write_texture(shape, ring.brdf_net, s, faces)
     write_texture(shape, ring.brdf_net, *ring.domain.sample(1))
     assert len(calls) == 3
+    for seed in range(4):  # points that are gone leave their memory to others
+        write_texture(shape, ring.brdf_net, *ring.domain.sample(2, torch.Generator().manual_seed(seed)))
+    assert len(calls) == 7
 
 
 def test_a_bsdf_with_its_own_mesh_attribute_shows_the_texture():
@@ -281,3 +286,20 @@ def test_a_bsdf_with_its_own_mesh_attribute_shows_the_texture():
     kinds = {t.get("name"): t.get("type") for t in ElementTree.fromstring(fine).iter("texture")}
     assert kinds == {"base_color": "fine_attribute", "roughness": "mesh_attribute"}
     assert with_fine_attribute(xml, "vertex_diffuse") == xml
+
+
+def test_the_scale_of_an_attribute_stays():
+    shape = sphere({"type": "diffuse", "reflectance": COLOUR | {"scale": 1.5}}, 1)
+    write_texture(shape, Coloured(lambda s: torch.full_like(s, 0.5), 0.1), *triangles(shape))
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0.1, 0.2, 4), mi.Vector3f(0, 0, -1)))
+    (texture,) = fine_textures(shape.bsdf())
+    np.testing.assert_allclose(np.array(texture.eval_3(si, mi.Bool(True))).ravel(), 0.375)
+
+
+def test_a_mesh_of_mitsuba_has_no_texture_to_remove():
+    mesh = mi.load_dict({"type": "rectangle"})
+    ball = mi.Mesh("ball", 3, 1)
+    ball.set_bsdf(mi.load_dict({"type": "cooktorrance"}))
+    for shape in (mesh, ball):
+        mesh_texture.remove_texture(shape)

@@ -122,7 +122,10 @@ class Predictor:
         self.visibility = Visibility(self.vertices, self.faces, [])
 
     def of(self, shot: Shot) -> Expected:
-        """Predict a photograph. A pixel is usable if it and its neighbours show only the object, lit, no highlight."""
+        """Predict a photograph.
+
+        A pixel is usable if it and its neighbours show only the object, are lit, and have no strong highlight.
+        """
         photographs = Photographs.of([shot], self.refined.room, self.refined.lobes)
 
         def drawn() -> tuple[np.ndarray, np.ndarray]:

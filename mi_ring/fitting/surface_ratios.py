@@ -15,7 +15,7 @@ CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have
 PATCHES, PATCH = 300, 64  #: places at which photographs are compared with each other, and number of points of each
 FEWEST, LEAST = 3, 0.01  #: number of photographs that are compared with each other; least weight of one
 USUAL = 2.0  #: variances up to this multiple of their median are usual
-FLAT = 1e-3  #: smaller differences of logarithms are nothing
+FLAT, SAME = 1e-3, 1e-3  #: smaller differences of logarithms are nothing; nor are smaller variances, in usual ones
 
 
 class Points(NamedTuple):
@@ -154,10 +154,10 @@ class Comparison:
     def trust(self) -> np.ndarray:
         """Return weights (count,) of the photographs: 1, or down to `LEAST` if one differs from the median of all.
 
-        Of each patch, only differences from its mean count: light and shape of the fit are not exact. They are divided
-        by what is usual in this patch, since photographs show different ones. A photograph may have more or less
-        contrast than the median, which is blurred if most photographs are: what counts is the rest, relative to the
-        photograph's own contrast.
+        Of each patch, only differences from its mean count: light and shape of the fit are not exact. Each photograph
+        sees other patches, so differences are divided by what is usual in their patch. The median times a factor, the
+        photograph's contrast, is subtracted. What remains, divided by the contrast, counts. So a sharp photograph among
+        blurred ones is not doubted.
         """
         seen = np.isfinite(self.ratios[..., 0])
         seen &= seen.sum(2, keepdims=True) >= self.triangles.shape[1] / 2
@@ -174,6 +174,6 @@ class Comparison:
             contrast = np.clip(np.nan_to_num(contrast, nan=1.0), 1e-3, None)
             rest = fine - contrast[:, None, None, None] * median
             variance = np.nanmean(np.square(rest), (1, 2, 3)) / contrast**2
-            usual = np.maximum(USUAL * np.nanmedian(variance), FLAT)
+            usual = np.maximum(USUAL * np.nanmedian(variance), SAME)
         excess = np.where(variance > usual, variance / usual, 1.0)  # 1 where nothing can be compared
         return np.maximum(excess**-2, LEAST)

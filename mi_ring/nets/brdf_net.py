@@ -107,7 +107,7 @@ class MaterialNet(nn.Module):
         """Compute factors (..., 3) of the albedo at domain points (..., 3). Returns None if there is no texture.
 
         `forward` leaves it out, because it is too fine for the vertices of a mesh. A class with a texture must also
-        have a method `texture_cell`.
+        have a method `texture_cell`. What changes the texture must be a parameter or a buffer.
         """
         return None
 

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 from mi_ring.nets.brdf_net import MaterialNet
 from mi_ring.nets.registry import architecture_of, build, register_network
 from mi_ring.nets.shape_net import Flow
+from mi_ring.scene.mesh_texture import stamp
 from mi_ring.system.machine import release_memory
 
 CORNERS = torch.tensor(list(itertools.product((0, 1), repeat=3)))  #: (8, 3) of a cube
@@ -147,14 +148,6 @@ class _Product(torch.autograd.Function):
 def wants_gradient(s: Tensor) -> bool:
     """Return True if a gradient with respect to the points `s` is wanted. In a fit it is not."""
     return s.requires_grad and torch.is_grad_enabled()
-
-
-def stamp(*tensors: Tensor) -> tuple:
-    """Return a value that stays the same until one of the tensors is another one or is changed in place.
-
-    Another tensor may get the memory of one that is gone. So keep them as long as the stamp.
-    """
-    return tuple((t.data_ptr(), t.shape, 0 if t.is_inference() else t._version) for t in tensors)
 
 
 def keys_of(cubes: Tensor) -> Tensor:

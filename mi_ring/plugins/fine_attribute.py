@@ -13,6 +13,7 @@ class FineAttribute(mi.Texture):
     Parameter      Type      Description                                                          Flags
     ============== ========= ==================================================================== =====
     ``name``       string    the mesh attribute, for instance ``vertex_diffuse``
+    ``scale``      float     factor of the attribute. Default: 1
     ============== ========= ==================================================================== =====
 
     Without factors, the texture is the attribute itself. The `shapenet` shape writes them if its fit has a texture that
@@ -22,9 +23,11 @@ class FineAttribute(mi.Texture):
     second and the third vertex. Points are in the order of j, then of i. Between them, factors are linear. Triangles
     share no points, but factors at common edges should be equal.
 
-    Several shapes may share the texture. Each has its own factors.
+    Products are clipped to the range of the fitted colour. Several shapes may share the texture. Each has its own
+    factors, which are then called ``factors_<id of the shape>``.
 
-    What it does not do: factors in scalar, spectral and monochrome variants, and on meshes with texture coordinates.
+    What it does not do: factors in scalar, spectral and monochrome variants; factors on meshes with texture
+    coordinates, whose ``uv`` are not barycentric; factors of a single channel.
 
     Raises ValueError if there is no ``name``.
 
@@ -46,14 +49,16 @@ class FineAttribute(mi.Texture):
         self.attribute = props.get("name", "")
         if not self.attribute:
             raise ValueError(f'fine_attribute "{props.id()}": name is missing, must be that of a mesh attribute')
-        self.base = mi.load_dict({"type": "mesh_attribute", "name": self.attribute})
-        self.lattices = weakref.WeakKeyDictionary()  #: of shapes
+        scale = props.get("scale", 1.0)
+        self.base = mi.load_dict({"type": "mesh_attribute", "name": self.attribute, "scale": scale})
+        self.lattices = weakref.WeakKeyDictionary()  #: by shape; weak, so that a texture keeps no shape alive
 
     def set_lattice(self, shape, lattice):
         """Set the factors of a shape. `lattice`: a `Lattice`; None: the shape has none."""
-        self.lattices.pop(shape, None)
         if lattice is not None:
             self.lattices[shape] = lattice
+        elif len(self.lattices):  # meshes that are not Python's have none, and cannot be asked for
+            self.lattices.pop(shape, None)
 
     def factored(self, value, si, active):
         """Multiply the attribute's values at the surface interactions `si` by the factors."""
@@ -79,8 +84,9 @@ class FineAttribute(mi.Texture):
         return True
 
     def traverse(self, callback):
-        for number, lattice in enumerate(self.lattices.values()):
-            callback.put(f"factors{number or ''}", lattice.factors, mi.ParamFlags.Differentiable)
+        for shape, lattice in self.lattices.items():
+            name = "factors" if len(self.lattices) == 1 else f"factors_{shape.id()}"
+            callback.put(name, lattice.factors, mi.ParamFlags.Differentiable)
 
     def to_string(self):
         divisions = ", ".join(str(lattice.divisions) for lattice in self.lattices.values())

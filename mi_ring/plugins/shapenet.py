@@ -56,7 +56,7 @@ class ShapeNetMesh(mi.Mesh):
     and, unless the fit had ``--diffuse lambert``, ``vertex_diffuse_roughness`` (1 each). Without ``weights`` the mesh
     has the first three, with the values 0.5, 0 and 0.5. An error is raised if the nested BSDF needs an attribute that
     the mesh does not have, or reads one with another number of channels. If the fit has a texture that is finer than
-    the mesh, it is given to each `fine_attribute` of the nested BSDF, such as the colour of a `cooktorrance`.
+    the mesh, each `fine_attribute` that reads the albedo shows it, such as the colour of a `cooktorrance`.
 
     What it does not do: texture coordinates; colours in spectral variants, where Mitsuba reads attributes of three
     channels as coefficients of a spectrum.

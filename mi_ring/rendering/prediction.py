@@ -38,8 +38,9 @@ def render(
     lamps. `lobes`: empty, or (unit directions (n, 3), sharpness (n,)) of the lobes in `photographs`.
 
     Returns (linear radiance (N, H, W, 3), coverage (N, H, W) in [0, 1]). Gradients with respect to all tensors contain
-    shading, outlines and edges of cast shadows. Writes the mesh of `surface`. Call backward at most once, before the
-    surface is written again; otherwise it raises RuntimeError. Raises ValueError if a tensor does not fit the mesh.
+    shading, outlines and edges of cast shadows. Writes the mesh of `surface`, whose texture stays. Call backward at
+    most once, before the surface is written again; otherwise it raises RuntimeError. Raises ValueError if a tensor does
+    not fit the mesh.
     """
     parameters = surface.parameters(vertices, attributes)
     others = [*(views or ()), *lamps]

@@ -109,7 +109,8 @@ def with_fitted_shape(
 ) -> tuple[mi.Scene, mi.Mesh]:
     """Make a scene in which a new shape replaces `shape`. Returns (new scene, new shape).
 
-    The new shape has the BSDF of `ring` and the mesh attributes that this BSDF reads, with arbitrary values. Its
+    The new shape has the BSDF of `ring`, which reads the albedo by `fine_attribute`, and the mesh attributes that this
+    BSDF reads, with arbitrary values. Its
     vertices are not those of the object yet. They lie on a sphere around the object, because Mitsuba places distant
     emitters outside of the scene's bounding sphere when the scene is made. `unit`: length unit of the new scene [units
     of `ring`].

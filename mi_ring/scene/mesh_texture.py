@@ -14,7 +14,7 @@ from mi_ring.scene.mesh_attributes import fine_textures
 
 MOST, AT_ONCE = 8_000_000, 2**19  #: points of all lattices, and of those that are computed at once
 MEASURED = 100_000  #: triangles whose edges are measured
-ROUND = 1e-4  #: a domain is the unit sphere if its vertices are at most this far from it
+ROUND = 1e-4  #: a domain is the unit sphere if its vertices are this close to it
 
 
 class Lattice(NamedTuple):
@@ -26,7 +26,8 @@ class Lattice(NamedTuple):
     high: float
 
 
-#: By the material: what its last lattice was made of, and the lattice. A film shows one texture in many states.
+#: By the material: what its last lattice was made of, the points, and the lattice. A film shows one texture in many
+#: states. The points are kept because others could get their memory, and so their stamp.
 latest: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
 
 
@@ -41,13 +42,13 @@ def write_texture(shape: mi.Mesh, net: Any, s: Tensor, faces: np.ndarray) -> Non
     textures = [texture for texture in fine_textures(shape.bsdf()) if albedo and texture.attribute == albedo.attribute]
     if not textures or cell is None or not mi.is_rgb or mi.variant().startswith("scalar"):
         return
-    made_of = mi.variant(), faces, stamp([s, *net.parameters(), *net.buffers()])
-    known, lattice = latest.get(net, (None, None))
-    if known is None or known[0] != made_of[0] or known[1] is not faces or known[2] != made_of[2]:
+    made_of = mi.variant(), stamp(s, *net.parameters(), *net.buffers())
+    known, same_faces, _, lattice = latest.get(net, (None, None, None, None))
+    if known != made_of or same_faces is not faces:
         divisions = divisions_for(s, faces, cell)
         factors = to_flat(mi.Float, factors_at(net, s.cpu(), np.ascontiguousarray(faces, np.int64), divisions))
         lattice = Lattice(factors, divisions, albedo.low, albedo.high)
-        latest[net] = made_of, lattice
+        latest[net] = made_of, faces, s.detach(), lattice
     for texture in textures:
         own = mi.Float(lattice.factors)  # so that changes by `mi.traverse` change no other shape
         texture.set_lattice(shape, lattice._replace(factors=own))
@@ -90,6 +91,9 @@ def divisions_for(s: Tensor, faces: np.ndarray, cell: float) -> int:
     return max(1, min(math.ceil(float(edges.quantile(0.9)) / cell), most))
 
 
-def stamp(tensors: list[Tensor]) -> list[tuple]:
-    """Return a value that stays the same until one of the tensors is another one or is changed in place."""
-    return [(t.data_ptr(), t.shape, 0 if t.is_inference() else t._version) for t in tensors]
+def stamp(*tensors: Tensor) -> tuple:
+    """Return a value that stays the same until one of the tensors is another one or is changed in place.
+
+    Another tensor may get the memory of one that is gone. So keep them as long as the stamp.
+    """
+    return tuple((t.data_ptr(), t.shape, 0 if t.is_inference() else t._version) for t in tensors)

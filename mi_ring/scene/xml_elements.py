@@ -33,7 +33,10 @@ def load_bsdf(xml: str) -> mi.BSDF:
 
 
 def with_fine_attribute(xml: str, attribute: str) -> str:
-    """Let a BSDF read a mesh attribute by `fine_attribute` instead of `mesh_attribute`. `xml`: a <bsdf> element."""
+    """Return the XML of a BSDF that reads a mesh attribute by `fine_attribute` instead of `mesh_attribute`.
+
+    `xml`: a <bsdf> element. It is returned if it does not read the attribute.
+    """
     element = ElementTree.fromstring(xml)
     found = [texture for texture in element.iter("texture") if texture.get("type") == "mesh_attribute"
              and texture.find(f"string[@name='name'][@value='{attribute}']") is not None]  # fmt: skip
