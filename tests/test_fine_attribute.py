@@ -1,5 +1,6 @@
 """The plugin `fine_attribute`: factors on lattices in triangles, in Mitsuba's own integrators and in ours."""
 
+import gc
 import xml.etree.ElementTree as ElementTree
 
 import drjit as dr
@@ -29,6 +30,13 @@ KINDS = {
     "nested": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": COLOUR}},
 }
 SIZE = 48
+
+
+@pytest.fixture(autouse=True)
+def no_scenes_left():
+    """Some of these tests leave a scene, but take too little time for conftest.py to look for it."""
+    yield
+    gc.collect()
 
 
 def sphere(bsdf, level=1):
