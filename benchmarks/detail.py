@@ -228,8 +228,9 @@ def noise_limit(capture: Capture, truth: Path, electrons: float) -> dict[str, fl
         seen &= (value < 1).all(1)
         pixels = seen * (normals * away).sum(1) / np.linalg.norm(away, axis=1)
         information += np.einsum("n,nc,nci,ncj->nij", pixels, value**2 / noise, change, change)
-    told = np.linalg.eigvalsh(information)[:, 0] > 1e-6 * np.linalg.eigvalsh(information)[:, -1].max()
-    variances = np.diagonal(np.linalg.inv(information[told]), axis1=1, axis2=2)
+    eigenvalues = np.linalg.eigvalsh(information)  # least first
+    told = information[eigenvalues[:, 0] > 1e-6 * eigenvalues[:, -1].max()]
+    variances = np.diagonal(np.linalg.inv(told), axis1=1, axis2=2)
     bent = np.degrees(np.sqrt(np.median(variances[:, 3:].sum(1))))
     coloured = 100 * np.sqrt(np.median(variances[:, :3].mean(1)))
     white = np.random.default_rng(0).normal(size=(256, 256, 1)).astype(np.float32)

@@ -69,7 +69,7 @@ def predicted_parameters(
     xml = ElementTree.tostring(element, "unicode")
     try:
         loaded = load_bsdf(xml)
-        left = attributes_of(loaded) - optional_of(loaded) - {f"vertex_{p.name}" for p in parameters}
+        left = attributes_of(loaded) - optional_of(loaded) - {p.attribute for p in parameters}
     except InputError as error:
         raise InputError(f"{scene}: {error}; see --parameters") from error
     if left:
@@ -86,7 +86,7 @@ def add_coat(element: ElementTree.Element) -> None:
     for p in COAT:
         if element.find(f"*[@name='{p.name}']") is None:
             texture = ElementTree.SubElement(element, "texture", name=p.name, type="mesh_attribute")
-            ElementTree.SubElement(texture, "string", name="name", value=f"vertex_{p.name}")
+            ElementTree.SubElement(texture, "string", name="name", value=p.attribute)
 
 
 def initial_output(value: np.ndarray, low: float, high: float) -> float:

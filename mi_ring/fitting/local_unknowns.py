@@ -54,7 +54,7 @@ class Patches:
         self.of_vertex = numbers.numpy()  #: (V,) number of the patch
         self.count = int(self.of_vertex.max()) + 1
         self.unknowns = [
-            LocalUnknown(f"vertex_{p.name}", FACTOR if np.isinf(p.high) else SHARE * (p.high - p.low), p.channels,
+            LocalUnknown(p.attribute, FACTOR if np.isinf(p.high) else SHARE * (p.high - p.low), p.channels,
                          low=p.low, high=p.high) for p in material
         ]  # fmt: skip
         if not surface.shape.has_face_normals():

@@ -15,7 +15,8 @@ CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have
 PATCHES, PATCH = 300, 64  #: places at which photographs are compared with each other, and number of points of each
 FEWEST, LEAST = 3, 0.01  #: number of photographs that are compared with each other; least weight of one
 USUAL = 2.0  #: variances up to this multiple of their median are usual
-FLAT, SAME = 1e-3, 1e-3  #: smaller differences of logarithms are nothing; nor are smaller variances, in usual ones
+FLAT = 1e-3  #: smaller differences of logarithms count as none
+SAME = 1e-3  #: smaller variances, relative to what is usual in a patch, count as none
 
 
 class Points(NamedTuple):

@@ -45,11 +45,6 @@ ROUGH = Parameter("diffuse_roughness", 1, 0.0, 1.0, -3.0)
 COAT = Parameter("coat", 1, 0.0, math.inf, -3.0), Parameter("coat_roughness", 1, 0.0, 1.0, -1.5)
 
 
-def albedo_of(parameters: Sequence[Parameter]) -> Parameter | None:
-    """Return the parameter that is the albedo, the colour without gloss. Returns None if there is none."""
-    return next((p for p in parameters if p.name in ALBEDO and p.channels == 3), None)
-
-
 class MaterialNet(nn.Module):
     """Base class of BRDF-Net: a network that maps a point of the domain to the parameters of a BSDF.
 
@@ -74,8 +69,8 @@ class MaterialNet(nn.Module):
 
     @property
     def albedo(self) -> Parameter | None:
-        """The parameter that is the albedo. None if there is none."""
-        return albedo_of(self.bsdf_parameters)
+        """The parameter that is the albedo, the colour without gloss. None if there is none."""
+        return next((p for p in self.bsdf_parameters if p.name in ALBEDO and p.channels == 3), None)
 
     @property
     def outputs(self) -> int:

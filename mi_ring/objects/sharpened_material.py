@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mi_ring.nets.brdf_net import MaterialNet, albedo_of
+from mi_ring.nets.brdf_net import MaterialNet
 from mi_ring.nets.registry import architecture_of, build, register_network
 from mi_ring.objects.detail import Grid
 
@@ -21,7 +21,7 @@ class SharpenedMaterial(MaterialNet):
         """
         base = build(net)
         super().__init__(base.bsdf_parameters)
-        if not albedo_of(base.bsdf_parameters) or grid["channels"] != 3:
+        if not base.albedo or grid["channels"] != 3:
             raise ValueError(f"a texture of {grid['channels']} channels does not suit the material")
         self.base: Any = base
         self.grid = Grid(**grid)

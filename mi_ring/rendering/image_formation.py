@@ -49,11 +49,13 @@ def render_maps(scene, photographs, attributes, pixels=None):
         for shape in scene.shapes():
             if shape.is_mesh() and shape.has_attribute(name):
                 here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
-                fine = [texture for texture in fine_textures(shape.bsdf()) if texture.attribute == name]
+                fine = {texture.attribute: texture for texture in fine_textures(shape.bsdf())}
                 if channels == 1:
                     found = [shape.eval_attribute_1(name, si, here)]
+                elif name in fine:
+                    found = fine[name].eval_3(si, here)
                 else:
-                    found = fine[0].eval_3(si, here) if fine else shape.eval_attribute_3(name, si, here)
+                    found = shape.eval_attribute_3(name, si, here)
                 values = [dr.select(here, new, old) for new, old in zip(found, values)]
         maps += values
     return maps

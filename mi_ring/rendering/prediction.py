@@ -147,7 +147,7 @@ def maps(
     W). Pixels without a surface are 0.
     """
     own, parts = photographs.in_units(surface.unit), []
-    attributes = {f"vertex_{p.name}": p.channels for p in parameters}
+    attributes = {p.attribute: p.channels for p in parameters}
     for pixels in photographs.chunks(1):
         parts.append(torch.stack(evaluated(render_maps(surface.scene, own, attributes, pixels)), -1))
     channels = torch.cat(parts).reshape(*photographs.shape, -1).cpu().numpy()

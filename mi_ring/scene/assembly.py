@@ -110,10 +110,9 @@ def with_fitted_shape(
     """Make a scene in which a new shape replaces `shape`. Returns (new scene, new shape).
 
     The new shape has the BSDF of `ring`, which reads the albedo by `fine_attribute`, and the mesh attributes that this
-    BSDF reads, with arbitrary values. Its
-    vertices are not those of the object yet. They lie on a sphere around the object, because Mitsuba places distant
-    emitters outside of the scene's bounding sphere when the scene is made. `unit`: length unit of the new scene [units
-    of `ring`].
+    BSDF reads, with arbitrary values. Its vertices are not those of the object yet. They lie on a sphere around the
+    object, because Mitsuba places distant emitters outside of the scene's bounding sphere when the scene is made.
+    `unit`: length unit of the new scene [units of `ring`].
     """
     new = mi.load_dict({
         "type": "shapenet", "id": shape.id(), "subdivisions": 0, "flash": shape.is_emitter(),
@@ -121,9 +120,9 @@ def with_fitted_shape(
         "bsdf": {"type": "cooktorrance"},
     })  # fmt: skip
     for parameter in ring.brdf_net.bsdf_parameters:
-        if not new.has_attribute(f"vertex_{parameter.name}"):
+        if not new.has_attribute(parameter.attribute):
             values = np.zeros(new.vertex_count() * parameter.channels, np.float32)
-            new.add_attribute(f"vertex_{parameter.name}", parameter.channels, values)
+            new.add_attribute(parameter.attribute, parameter.channels, values)
     albedo = ring.brdf_net.albedo
     new.set_bsdf(load_bsdf(with_fine_attribute(ring.bsdf, albedo.attribute) if albedo else ring.bsdf))
     require_attributes(new)

@@ -26,8 +26,8 @@ class Lattice(NamedTuple):
     high: float
 
 
-#: By the material: what its last lattice was made of, the points, and the lattice. A film shows one texture in many
-#: states. The points are kept because others could get their memory, and so their stamp.
+#: By the material: what its last lattice was made of, the triangles and points, and the lattice. A film shows one
+#: texture in many states. The points are kept because others could get their memory, and so their stamp.
 latest: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
 
 
