@@ -10,9 +10,11 @@ import torch
 import trimesh
 from helpers.matte_ball import MATTE, PALE, pale_ball, photographed, plain
 
+from mi_ring.capture.capture import Capture
 from mi_ring.capture.loading import load_capture
 from mi_ring.capture.observation import Observation
 from mi_ring.capture.pixels import Pixels
+from mi_ring.capture.reduction import reduced
 from mi_ring.fitting import fine_texture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.surface_ratios import Comparison, LowPass, Points, Ratios, bilinear
@@ -42,7 +44,7 @@ def sharpened(capture, ring, width=40, fitted=range(100)):
     surface = Surface(capture.scene, capture.shape, ring)
     surface.show(ring, *ring.domain.sample(ring.subdivisions))
     fitted = [k for k in fitted if k < len(capture)]
-    return fine_texture.sharpened(capture, capture, surface, ring, fitted, width)
+    return fine_texture.sharpened(capture, capture, capture, surface, ring, fitted, width)
 
 
 @pytest.fixture(scope="module")
@@ -246,6 +248,19 @@ def test_parts_of_the_surface_give_the_texture_of_the_whole(print_scene, sharp, 
     assert torch.equal(parts.brdf_net.grid.values[0], sharp.brdf_net.grid.values[0])
 
 
+def test_photographs_in_arrays_give_the_texture_of_those_in_files(print_scene, sharp):
+    whole, ring = load_capture(print_scene), pale_ball()
+    arrays = Capture.from_arrays(
+        [whole.images[k] for k in range(len(whole))], cameras=[shot.camera for shot in whole.shots],
+        lights=[shot.light for shot in whole.shots],
+    )  # fmt: skip
+    before = reduced(arrays, 40)
+    surface = Surface(before.scene, before.shape, ring)
+    surface.show(ring, *ring.domain.sample(ring.subdivisions))
+    found = fine_texture.sharpened(arrays, before, before, surface, ring, range(len(whole)), 40)
+    assert torch.equal(found.brdf_net.grid.values[0], sharp.brdf_net.grid.values[0])
+
+
 def test_of_many_photographs_some_are_used(print_scene, monkeypatch):
     capture = load_capture(print_scene, width=40)
     monkeypatch.setattr(fine_texture, "MOST_PHOTOGRAPHS", 4)
@@ -265,7 +280,7 @@ def test_a_material_without_albedo_has_no_texture(print_scene):
     ring = pale_ball()
     ring.brdf_net = BRDFNet(parameters=[Parameter("specular_reflectance", 3, 0.0, 1.0)])
     capture = load_capture(print_scene, width=40)
-    assert fine_texture.sharpened(capture, capture, None, ring, range(12), 40) is ring
+    assert fine_texture.sharpened(capture, capture, capture, None, ring, range(12), 40) is ring
 
 
 def test_highlights_are_subtracted_and_strong_ones_left_out(print_scene):
@@ -294,9 +309,9 @@ def test_highlights_are_subtracted_and_strong_ones_left_out(print_scene):
 def test_photographs_are_decoded_with_the_curve_that_the_fit_has_found(print_scene):
     capture = load_capture(print_scene, width=40)
     given = capture.shots[0]
+    changed = (replace(given, response=Response(curve)) for curve in (ToneCurve(), ToneCurve(gamma=2)))
     plain, curved = (
-        fine_texture.enlarged(capture, 0, *fine_texture.at_width(given, replace(given, response=Response(curve)), 160))
-        for curve in (ToneCurve(), ToneCurve(gamma=2))
+        fine_texture.enlarged(capture, capture, 0, *fine_texture.at_width(given, shot, 160)) for shot in changed
     )
     assert plain.rgb.shape == (1, 148, 160, 3)  # what the fit sees at 40 px: whole blocks of 4 × 4 px
     np.testing.assert_allclose(curved.rgb, plain.rgb**0.5, atol=2e-3)

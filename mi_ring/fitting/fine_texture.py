@@ -49,20 +49,22 @@ SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
 
 
 def chosen_photographs(given: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
-    """Choose photographs for the texture: at most `MOST_PHOTOGRAPHS`, evenly among those of `fitted` with a file.
+    """Choose photographs for the texture: at most `MOST_PHOTOGRAPHS`, evenly among those of `fitted`.
 
-    Those without a light of their own are left out if there are others: their light is known less well.
+    Those without a light of their own are left out if there are others: their light is known less well. `given`: the
+    capture before it was reduced for the fit. A photograph of it that is an array and reduced is left out.
     """
-    found = [int(k) for k in np.intersect1d(fitted, given.photographs.mainly) if given.shots[k].files.filename]
+    whole = [shot.window is None or shot.files.filename is not None for shot in given.shots]
+    found = [int(k) for k in np.intersect1d(fitted, given.photographs.mainly) if whole[k]]
     return [found[place] for place in evenly_spaced(len(found), MOST_PHOTOGRAPHS)]
 
 
-def texture_width(given: Capture, index: Sequence[int]) -> int:
+def texture_width(before: Capture, index: Sequence[int]) -> int:
     """Choose the largest width of photographs for the texture [px]; higher ones are narrower. Returns 0 for none.
 
-    `given`: the capture of the fit, which may be reduced. `index`: the result of `chosen_photographs`.
+    `before`: the capture of the fit, which may be reduced. `index`: the result of `chosen_photographs`.
     """
-    shots = [given.shots[k] for k in index]
+    shots = [before.shots[k] for k in index]
     sizes = [shot.window.extent if shot.window else shot.size for shot in shots]
     return min(WIDEST, max((max(width, math.ceil(height / HIGHEST)) for width, height in sizes), default=0))
 
@@ -85,15 +87,17 @@ def at_width(given: Shot, refined: Shot, width: int) -> tuple[Shot, Shot]:
     return given.whole.through(window), refined.whole.through(window)
 
 
-def enlarged(before: Capture, k: int, own: Shot, shot: Shot) -> Observation:
-    """Read photograph `k` of the capture `before` at another width, decoded with the refined response of the camera.
+def enlarged(given: Capture, before: Capture, k: int, own: Shot, shot: Shot) -> Observation:
+    """Read photograph `k` at another width, decoded with the refined response of the camera.
 
-    Its mask and its valid pixels are those of the fit, enlarged. `own`, `shot`: as `at_width` returns them. Raises
-    InputError if the file cannot be read.
+    Its mask and its valid pixels are those of the fit, enlarged. `given`, `before`: the capture before and after it was
+    reduced for the fit. `own`, `shot`: as `at_width` returns them. Raises InputError if a file cannot be read.
     """
     assert own.window
     size = own.window.size
-    image = reduced_image(shot.whole, partial(read_photograph, own.whole, before.path), own.window)
+    from_file = partial(read_photograph, own.whole, before.path)
+    read = given.images.readers[k] if given.shots[k].window is None else from_file
+    image = reduced_image(shot.whole, read, own.window)
     mask, valid = (None if part is None else cv2.resize(part, size) for part in (before.masks[k], before.valid[k]))
     return observed(shot, image, mask, valid, 1)
 
@@ -180,17 +184,17 @@ def ratios_of(expected: Expected, photograph: np.ndarray, points: Points, triang
 
 @torch.no_grad()
 def sharpened(
-    before: Capture, refined: Capture, surface: Surface, ring: FittedObject, fitted: Sequence[int] | np.ndarray,
-    width: int,
+    given: Capture, before: Capture, refined: Capture, surface: Surface, ring: FittedObject,
+    fitted: Sequence[int] | np.ndarray, width: int,
 ) -> FittedObject:  # fmt: skip
     """Return an object with the networks of `ring` and a texture from the photographs, or `ring` itself.
 
-    It is `ring` if there are no photographs with files, if they show nothing that its colours lack, or if the material
-    has no albedo. `before`, `refined`: the capture before and after the calibration by the fit. `surface`: shows the
-    object `ring`, in the light of the fit. `fitted`: indices of the photographs to use. `width`: of the photographs in
-    the last stage of the fit [px]. Raises InputError if a file cannot be read.
+    It is `ring` if there are no photographs, if they show nothing that its colours lack, or if the material has no
+    albedo. `given`: the capture before it was reduced for the fit. `before`, `refined`: that of the fit, before and
+    after calibration. `surface`: shows the object `ring`, in the light of the fit. `fitted`: indices of the photographs
+    to use. `width`: of the photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
-    index = chosen_photographs(before, fitted)
+    index = chosen_photographs(given, fitted)
     widest, albedo = texture_width(before, index), ring.brdf_net.albedo
     if not widest or not albedo:
         return ring
@@ -217,7 +221,7 @@ def sharpened(
         weights = ((normals * away).sum(1) / distance).clip(0, 1) ** SLANT
         weights *= (camera.focal.mean() / resolution / distance) ** 2
         triangles = np.flatnonzero(expected.visible[faces].all(1))
-        photograph, (pixels, _) = with_usable_pixels(enlarged(before, k, *shots[k])), camera.project(vertices)
+        photograph, (pixels, _) = with_usable_pixels(enlarged(given, before, k, *shots[k])), camera.project(vertices)
         number, parts = index.index(k), 1 + len(triangles) * len(ratios.points.shares) // AT_ONCE
         again = trust[number] < 1
         factor = trust[number] - again  # negative the second time: what was too much is taken out

@@ -51,7 +51,8 @@ def result_of(
         release_memory()  # of the last stage
         try:
             surface = renderer.show(model, ring.subdivisions)
-            sharp = sharpened(capture, refined, surface, ring, problem.fitted, max(problem.config.widths))
+            width = max(problem.config.widths)
+            sharp = sharpened(problem.given, capture, refined, surface, ring, problem.fitted, width)
             if sharp is ring or texture_helps(problem, refined, surface, ring, sharp):
                 ring = sharp
             else:
