@@ -53,10 +53,24 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.xdist_group(item.module.__name__))
 
 
-def pytest_collection_finish():
-    """What is there by now stays: to look through it would take half a second after each of thousands of tests."""
+def free_garbage():
+    """What is there afterwards stays: to look through all of it takes a quarter of a second each time."""
     gc.collect()
     gc.freeze()
+
+
+def pytest_collection_finish():
+    free_garbage()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Free also what fixtures of a module leave, after its last test."""
+    result = yield
+    if nextitem is None or nextitem.module is not item.module:
+        gc.unfreeze()
+        free_garbage()
+    return result
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +82,7 @@ def no_scenes_of_other_tests():
     started = time.process_time()
     yield
     if time.process_time() - started > 0.1:
-        gc.collect()
+        free_garbage()
 
 
 def missing_package(error: BaseException | None) -> str | None:
