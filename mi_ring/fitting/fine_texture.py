@@ -96,7 +96,7 @@ def enlarged(given: Capture, before: Capture, k: int, own: Shot, shot: Shot) -> 
     assert own.window
     size = own.window.size
     from_file = partial(read_photograph, own.whole, before.path)
-    read = given.images.readers[k] if given.shots[k].window is None else from_file
+    read = (given.shots[k].window is None and given.images.readers[k]) or from_file
     image = reduced_image(shot.whole, read, own.window)
     mask, valid = (None if part is None else cv2.resize(part, size) for part in (before.masks[k], before.valid[k]))
     return observed(shot, image, mask, valid, 1)
