@@ -124,7 +124,7 @@ class Exposure(Unknown):
     It is 0 for photographs that are held out, and for those whose factor is known: see `Rig.exposed`.
     """
 
-    doubt = 0.01
+    doubt = 0.015
     solved = True
 
     def concerns(self, rig: Rig, lit: bool) -> bool:
