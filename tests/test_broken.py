@@ -143,6 +143,8 @@ BROKEN = {
                                     image("images/004.exr", np.full((40, 56, 3), 1e38, np.float32))), [],
                              ["004.exr", "above 1e+18"]),
     "all black": (all_of(*(image(f"images/{k:03}.png", IMAGE) for k in range(12))), [], ["small.xml", "black"]),
+    "all over-exposed": (all_of(*(image(f"images/{k:03}.png", IMAGE + 255) for k in range(12))), [],
+                         ["small.xml", "over-exposed"]),
     "8 bits declared linear": (xml('images/004.png"/>', 'images/004.png"/><string name="encoding" value="linear"/>'),
                                [], ["small.xml", '"004"', "encoding", "8 bits"]),
     "unknown encoding": (xml('images/004.png"/>', 'images/004.png"/><string name="encoding" value="raw"/>'), [],

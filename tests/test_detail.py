@@ -14,7 +14,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting import agreeing_adam, result
 from mi_ring.fitting.agreeing_adam import AgreeingAdam
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.detail_stage import add_detail, detail_levels, share_weights, unfold
+from mi_ring.fitting.detail_stage import add_detail, detail_levels, share_weights, smooth_between, unfold
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.optimisation import detail_steppers
 from mi_ring.fitting.schedule import Schedule
@@ -148,6 +148,25 @@ def test_without_values_nothing_changes_and_networks_are_fixed():
     assert ring.subdivisions == 4
     free = {name for name, p in ring.named_parameters() if p.requires_grad}
     assert free == {name for name, _ in ring.named_parameters() if ".grid." in name}
+
+
+@pytest.mark.parametrize("trained", [3, 4])
+def test_what_the_flow_does_between_trained_vertices_is_taken_away(trained):
+    """Waves of less than two edges of the trained mesh, on a sphere; long waves stay."""
+    ring = small()
+    s, faces = ring.domain.sample(4)
+    edge = float((s[faces[:, 0]] - s[faces[:, 1]]).norm(dim=1).mean())
+    waves = [0.1 * edge * torch.cos(2 * math.pi / (edge * length) * s[:, 2]) for length in (3.5, 20.0)]
+    ring.shape_net.forward = lambda points, time=1.0: points * (1 + sum(waves))[:, None]
+    add_detail(ring, 4, 2.5 / edge)  # cubes of half an edge
+    smooth_between(ring, 4, trained)
+    left = (ring.shape_net(s) * s).sum(1).detach() - 1
+    if trained == 4:
+        assert torch.allclose(left, sum(waves), atol=1e-6)
+        return
+    middle = s[:, 2].abs() < 0.5  # elsewhere waves along z are longer on the surface
+    solved = torch.linalg.lstsq(torch.stack(waves, 1)[middle], left[middle, None]).solution
+    assert abs(float(solved[0])) < 0.35 and float(solved[1]) == pytest.approx(1, abs=0.1)
 
 
 def test_displacement_is_along_the_normal_in_cells():

@@ -193,6 +193,19 @@ def test_there_are_as_many_points_as_the_detail_needs_and_memory_allows(monkeypa
     assert 20 * (n + 1) * (n + 2) / 2 == 200
 
 
+def test_factors_of_another_number_are_refused():
+    shape = sphere({"type": "cooktorrance"})
+    s, faces = triangles(shape)
+    write_texture(shape, Coloured(lambda s: 1 + 0 * s, 0.1), s, faces)
+    params = mi.traverse(shape)
+    (key,) = (name for name, _ in params if name.endswith("factors"))
+    needed = len(params[key])
+    params[key] = mi.Float(np.ones(needed - 3, np.float32))
+    with pytest.raises(ValueError, match=f"factors: has {needed - 3} numbers, must have {needed}: three"):
+        params.update()
+    assert needed == 3 * len(faces) * len(lattice_points(fine_textures(shape.bsdf())[0].lattices[shape].divisions))
+
+
 def test_a_name_is_needed():
     with pytest.raises(RuntimeError, match="name is missing"):
         mi.load_dict({"type": "fine_attribute"})

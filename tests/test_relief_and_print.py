@@ -9,6 +9,7 @@ from mi_ring.capture.loading import load_capture
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.fit import Fit
 from mi_ring.objects.fitted_object import FittedObject
+from mi_ring.objects.sharpened_material import SharpenedMaterial
 from mi_ring.output.atlas import reflectances
 from mi_ring.system.machine import threads_of
 
@@ -42,8 +43,9 @@ def fitted(folder, colours, surface) -> tuple[FittedObject, FittedObject]:
         with torch.no_grad():
             last = [p for p in fit.ring.brdf_net.parameters() if p.shape == (5,)][-1]
             last[:3] = torch.from_numpy(np.log(np.expm1(MATTE / scale)))
-        fit.run()
-        return fit.result().ring, pale_ball()
+        ring = fit.run()
+        assert fit.result().ring is ring and isinstance(ring.brdf_net, SharpenedMaterial) == (colours is printed)
+        return ring, pale_ball()
 
 
 def normals_of(ring):

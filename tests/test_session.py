@@ -175,6 +175,28 @@ def test_results_that_cannot_go_where_they_should_go_elsewhere(small_capture, tm
     assert load_fit(where) and (where / "checkpoint.pt").exists() and not (where / "report.html").exists()
 
 
+def test_a_photograph_that_is_damaged_before_the_report_is_written(small_capture, tmp_path, monkeypatch):
+    """What is in the folder stays there, and the user is told to restore the file."""
+    running, folder = Fit(load_capture(small_capture), Config(**TINY)), tmp_path / "run"
+    keeper = session.Keeper(running, folder, lambda: None)
+    damaged = InputError(f"{small_capture.parent}/images/003.png: filename: is truncated; copy it again")
+    monkeypatch.setattr(results, "write", Mock(side_effect=damaged))
+    monkeypatch.setattr(keeper, "rescue", Mock())
+    with pytest.raises(InputError, match=r"003\.png: filename: is truncated; .*run has the results but the report"):
+        keeper.finish(b"")
+    assert not keeper.rescue.called
+
+
+def test_a_fit_says_why_it_has_no_details(small_capture):
+    def reason(count=12, **settings):
+        fit = Fit(load_capture(small_capture).part(range(count)), Config(**{**TINY, "detail": "both", **settings}))
+        return session.details_missing(fit)
+
+    assert "need 4 photographs" in reason(3, detail_share=20.0)
+    assert "iterations are too few" in reason(detail_share=0.1)
+    assert reason(detail_share=20.0) == reason(detail="none") == ""
+
+
 def test_ctrl_c_leaves_a_usable_folder_and_resume_finishes(small_capture, tmp_path, begun):
     folder = tmp_path / "run"
     options = ["--out", str(folder), "--iterations", "40", *BRIEF]

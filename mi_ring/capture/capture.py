@@ -236,16 +236,19 @@ class Capture:
         """Estimate the mean linear radiance of the object's pixels (1 = full scale of the files) from some photographs.
 
         Those without a light of their own are left out if there are others. In a photograph without a mask, pixels
-        above 2 % of its maximum count. Raises InputError if all of them are black.
+        above 2 % of its maximum count. Raises InputError if all of them are black, or all clipped.
         """
-        total, count, index = 0.0, 0, self.photographs.mainly
+        total, count, clipped, index = 0.0, 0, True, self.photographs.mainly
         for k in index[evenly_spaced(len(index), SOME)]:
             side = min(self.shots[k].size)
-            rgb, _, mask, masked, _ = self.observe([k], max(4 if side >= 16 else 1, side // COARSE))
+            rgb, over, mask, masked, _ = self.observe([k], max(4 if side >= 16 else 1, side // COARSE))
             inside = mask[0] > 0.5 if masked else rgb[0].mean(-1) > 0.02 * rgb.max()
+            clipped = clipped and bool(over[0][inside].all())
             total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
         if not total > 0:
             raise InputError(f"{self.path}: photographs: every pixel of the object is black; check exposure and masks")
+        if clipped:
+            raise InputError(f"{self.path}: photographs: every pixel of the object is over-exposed; take darker ones")
         return total / count
 
     @functools.cached_property

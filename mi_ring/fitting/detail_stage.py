@@ -8,7 +8,7 @@ import trimesh
 
 from mi_ring.fitting.problem import Problem
 from mi_ring.geometry.camera import pixels_per_unit
-from mi_ring.geometry.meshes import area_of, area_vectors
+from mi_ring.geometry.meshes import area_of, area_vectors, smoothed
 from mi_ring.nets.registry import is_registered
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
 from mi_ring.objects.fitted_object import FittedObject
@@ -17,6 +17,7 @@ from mi_ring.objects.ring_file import MAX_LEVEL
 SPACING, CELL = 1.2, 1.25  #: of the finest mesh's vertices, and side of the finest cubes [px]
 FEWEST_PHOTOGRAPHS = 4  #: that show whether they agree on details
 OCTAVES = 4  #: of the grids: the coarsest cubes are as large as what the networks represent
+STIFFNESS, SOLVING = 2.5, 10  #: of `smoothed`, for one edge of the trained mesh; steps to find values of corners
 STEEPEST, HALVINGS = 0.2, 8  #: least cosine between a triangle with and without details; see `unfold`
 
 
@@ -61,6 +62,29 @@ def add_detail(ring: FittedObject, level: int, resolution: float) -> None:
     ring.shape_net = DetailedFlow.of(ring.shape_net, grid, s, normals).to(s.device)
     share_weights(ring)
     ring.subdivisions = level
+
+
+@torch.no_grad()
+def smooth_between(ring: FittedObject, level: int, trained: int) -> None:
+    """Let displacements, in place, remove what the flow does between the vertices of the mesh that it was trained with.
+
+    Photographs have not determined it: normals of a mesh one level finer are worse by a quarter. `level`: of the finest
+    mesh. `trained`: that of the flow.
+    """
+    s, faces = ring.domain.sample(level)
+    s = s.to(ring.center.device)
+    flow, ratio = ring.shape_net, 2.0 ** (level - trained)
+    if not isinstance(flow, DetailedFlow) or ratio <= 1:
+        return
+    points = flow.base(s, 1.0).cpu()
+    change = smoothed(points.numpy(), faces, STIFFNESS * ratio**4) - points.numpy()
+    normals = trimesh.Trimesh(points.numpy(), faces, process=False).vertex_normals
+    wanted = (change * normals).sum(1).astype(np.float32) / flow.grid.cells[-1]
+    weights, values = flow.grid.weights(s)[-1], flow.grid.values[-1]
+    nodes, total = np.zeros(len(values), np.float32), np.maximum(weights.T @ np.ones(len(s), np.float32), 1e-6)
+    for _ in range(SOLVING):  # for values of the corners whose interpolation is `wanted`
+        nodes += weights.T @ (wanted - weights @ nodes) / total
+    values.copy_(torch.from_numpy(nodes)[:, None])
 
 
 def share_weights(ring: FittedObject) -> None:

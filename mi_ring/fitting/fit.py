@@ -80,6 +80,7 @@ class Fit(Renamed):
         self.sampler, self.renderer = Sampler(self.problem), Renderer(self.problem, self.ring)
         self.optimisation = Optimisation(self.problem, self.model)
         self.regulariser, self.course = RegulariserStrength(), Course()
+        self.textured: FittedObject | None = None  #: the object with texture, if the fit is at its end and it was found
         self.capture = self.problem.capture  #: with the masks that are used now
         if state is not None:
             self.restore(copy.deepcopy(state))
@@ -91,10 +92,10 @@ class Fit(Renamed):
             yield self.step()
 
     def run(self) -> FittedObject:
-        """Run all iterations that are left. Returns the fitted object."""
+        """Run all iterations that are left. Returns the fitted object, with its texture if there is one."""
         for _ in self:
             pass
-        return self.ring
+        return self.result().ring
 
     def step(self) -> Iteration:
         """Make one iteration. Raises InputError if the fit diverges, RuntimeError if no iteration is left."""
@@ -143,7 +144,7 @@ class Fit(Renamed):
 
     @property
     def ring(self) -> FittedObject:
-        """The fitted object, as it is after the last iteration. Further iterations change it."""
+        """The fitted object without texture, as it is after the last iteration. Further iterations change it."""
         return self.model.ring
 
     @property
@@ -169,9 +170,14 @@ class Fit(Renamed):
         return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 
     def result(self) -> FitResult:
-        """Collect the results of the fit, for the functions of `mi_ring.output` that write them."""
-        return result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
-                         list(self.loss.terms), self.regulariser.unexplained)  # fmt: skip
+        """Collect the results of the fit, for the functions of `mi_ring.output` that write them.
+
+        The texture, which takes long, is found once.
+        """
+        found = result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
+                          list(self.loss.terms), self.regulariser.unexplained, self.textured)  # fmt: skip
+        self.textured = found.ring if self.iteration == self.iterations else None
+        return found
 
     def save(self, folder: str | Path) -> None:
         """Write `ring.pt`, `mesh.ply`, `scene.xml`, `report.html` and other results into a folder.
@@ -195,5 +201,5 @@ class Fit(Renamed):
                 self.model.calibration.load_state_dict(state["calibration"])
             for name in PARTS:
                 getattr(self, name).restore(state[name])
-            self.course = Course.of(state["course"], self.iterations)
+            self.course, self.textured = Course.of(state["course"], self.iterations), None
             self.capture = with_masks(self.problem.capture, self.course.masks)

@@ -7,7 +7,14 @@ from torch import nn
 from mi_ring.calibration.calibration import Calibration
 from mi_ring.calibration.rig import Rig
 from mi_ring.capture.capture import Capture
-from mi_ring.fitting.detail_stage import FEWEST_PHOTOGRAPHS, add_detail, detail_levels, fit_resolution, share_weights
+from mi_ring.fitting.detail_stage import (
+    FEWEST_PHOTOGRAPHS,
+    add_detail,
+    detail_levels,
+    fit_resolution,
+    share_weights,
+    smooth_between,
+)
 from mi_ring.fitting.lighting import room_frames
 from mi_ring.fitting.problem import Problem
 from mi_ring.fitting.refinement import Refinement
@@ -57,9 +64,13 @@ class Model(nn.Module):
         """Return True if details have been added to the networks."""
         return isinstance(self.ring.shape_net, DetailedFlow) and isinstance(self.ring.brdf_net, DetailedMaterial)
 
-    def add_detail(self, level: int) -> None:
-        """Add details, which are 0, to both networks, and freeze the networks. `level`: level of the finest mesh."""
+    def add_detail(self, level: int, trained: int) -> None:
+        """Add details to both networks, and freeze the networks.
+
+        `level`: of the finest mesh. `trained`: that with which the networks were trained.
+        """
         add_detail(self.ring, level, self.resolution)
+        smooth_between(self.ring, level, trained)
 
     def remove_detail(self) -> tuple[Flow, MaterialNet]:
         """Remove the details, and return the networks that had them: (Shape-Net, BRDF-Net)."""

@@ -183,7 +183,7 @@ class Optimisation:
             unfold(self.model.ring, schedule.stage(iteration - 1).level)
         stage = schedule.stage(iteration) if iteration < schedule.iterations else None
         if stage and stage.detail and not self.model.detailed:
-            self.model.add_detail(schedule.final_level)
+            self.model.add_detail(schedule.final_level, schedule.trained_level)
             self.begin()
         if self.model.detailed:
             return

@@ -1,5 +1,6 @@
 """Collects the results of a fit."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,7 @@ from mi_ring.fitting.renderer import Renderer
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.fitting.summary import summary
 from mi_ring.fitting.validation import texture_helps
+from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.output.fit_result import FitResult
 from mi_ring.scene.assembly import lamp_lights
 from mi_ring.system.command import interrupted
@@ -27,7 +29,7 @@ SAME = 1e-5  #: relative difference below which room light is nothing but the sc
 
 def result_of(
     problem: Problem, model: Model, renderer: Renderer, schedule: Schedule, course: Course, capture: Capture,
-    terms: Sequence[str], unexplained: float,
+    terms: Sequence[str], unexplained: float, textured: FittedObject | None = None,
 ) -> FitResult:  # fmt: skip
     """Collect the results of a fit, from which files are written later. Writes no files, but evaluates the surface.
 
@@ -35,9 +37,10 @@ def result_of(
     held-out photographs show that details or the texture are wrong. Before, the caches of `capture` are emptied.
 
     `capture`: the capture with its final masks. `terms`: names of the terms of the loss. `unexplained`: share of the
-    observed light that recent predictions do not explain.
+    observed light that recent predictions do not explain. `textured`: the object with texture, if it is known already.
     """
-    calibration, ring, refined = model.calibration, model.ring, model.calibrated(capture)
+    calibration, ring, refined = model.calibration, textured or model.ring, model.calibrated(capture)
+    started = time.perf_counter()
 
     def summarised() -> dict[str, Any]:
         masked = replace(problem, capture=capture)
@@ -46,7 +49,7 @@ def result_of(
     # Otherwise the room's axes are those of the scene file.
     found_alone = problem.lighting.kind != "capture" or problem.capture.photographs.mixed
     detailed = schedule.stages[-1].detail and "detail" not in course.validation.get("put_back", [])
-    if course.iteration == schedule.iterations and detailed and problem.config.detail != "shape":
+    if not textured and course.iteration == schedule.iterations and detailed and problem.config.detail != "shape":
         capture.clear_caches()
         release_memory()  # of the last stage
         try:
@@ -63,6 +66,7 @@ def result_of(
             release_memory()
             kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
             print(f"There is no texture: {kind}{error}")
+        course.seconds += time.perf_counter() - started
     return FitResult(
         ring=ring,
         surface=renderer.show(model, ring.subdivisions),

@@ -97,6 +97,11 @@ class Schedule:
         return next((stage.first for stage in self.stages if stage.settles or stage.detail), self.iterations)
 
     @property
+    def trained_level(self) -> int:
+        """Level of the finest mesh with which the networks are trained."""
+        return max(stage.level for stage in self.stages if not stage.detail)
+
+    @property
     def final_level(self) -> int:
         """Level of the icosphere in the last stage."""
         return self.stages[-1].level

@@ -19,6 +19,7 @@ from mi_ring.errors import InputError
 from mi_ring.fitting.budget import Costs, measure, seconds_per_iteration
 from mi_ring.fitting.checkpoint import BEFORE, digests, write_checkpoint
 from mi_ring.fitting.coat_selection import described
+from mi_ring.fitting.detail_stage import FEWEST_PHOTOGRAPHS
 from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.processes import ProcessLost
@@ -120,7 +121,11 @@ class Keeper:
             self.folder.mkdir(parents=True, exist_ok=True)
             results.write(self.folder, result, fitted_scene)
         except (InputError, OSError) as error:
-            raise InputError(f"{str(error).partition(';')[0]}; {self.rescue(result, fitted_scene)}") from error
+            what = str(error).partition(";")[0]
+            if not what.startswith(str(self.folder)) and any(Path(file).name in what for file in self.files):
+                raise InputError(f"{what}; {self.folder} has the results but the report: restore the file, then the "
+                                 "same command and --resume") from error  # fmt: skip
+            raise InputError(f"{what}; {self.rescue(result, fitted_scene)}") from error
 
     def warn_of_changes(self) -> None:
         """Print which input files have changed since the fit began. Its results then come from both contents."""
@@ -206,6 +211,17 @@ def resume_hint(folder: Path) -> Iterator[None]:
         raise
 
 
+def details_missing(fit: Fit) -> str:
+    """Say why a fit that should find details finds none, for the user. Empty if it does, or if none are wanted."""
+    config = fit.problem.config
+    if config.detail == "none" or fit.schedule.stages[-1].detail:
+        return ""
+    if fit.model.detail_levels:
+        return f"{config.iterations} iterations are too few (--iterations, --detail-share)"
+    few = len(fit.problem.fitted) < FEWEST_PHOTOGRAPHS
+    return f"they need {FEWEST_PHOTOGRAPHS} photographs" if few else "no file could hold those of networks of your own"
+
+
 def start_of(fit: Fit) -> str:
     """Describe the start surface of a fit in words, for the user."""
     domain, place = fit.ring.domain, "({:.4g}, {:.4g}, {:.4g})".format(*fit.ring.center.tolist())
@@ -241,6 +257,8 @@ def run_session(fit: Fit, folder: Path, prepare: Callable[[], None], costs: Cost
                   "gets. The fit finds how strong they really are (--refine scale)")  # fmt: skip
         if processes.count > 1:
             print(f"{processes.count} processes share the points and photographs of each iteration")
+        if missing := details_missing(fit):
+            print(f"No details: {missing}")
         if not fit.iteration:
             print(f"Start: {start_of(fit)}")
             processes.on_first(lambda: results.write_inputs(

@@ -5,8 +5,11 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import scipy.sparse
 import torch
 import trimesh
+from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
 from mi_ring.errors import InputError, require_file
@@ -65,3 +68,23 @@ def area_vectors(points: Tensor, faces: Tensor) -> Tensor:
     """
     a, b, c = (points[corner] for corner in faces.T)
     return torch.linalg.cross(b - a, c - a)
+
+
+def smoothed(values: np.ndarray, faces: np.ndarray, strength: float) -> np.ndarray:
+    """Remove short waves from values (V, C) at the vertices of a mesh, such as their positions. Long waves stay.
+
+    `faces` (F, 3): triangles of a closed mesh. Solves (1 + `strength` L²) x = `values`, where L is the normalised
+    Laplacian of the mesh's edges ("Laplacian Mesh Optimization", Nealen et al. 2006). Waves of n edges have an
+    eigenvalue of L of about (2 π / n)² / 4, and are halved if `strength` times its square is 1.
+    """
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
+    both, count = np.concatenate([edges, edges[:, ::-1]]), len(values)
+    degrees = np.bincount(both[:, 0], minlength=count).astype(float)
+    root = np.sqrt(degrees)[:, None]
+    between = 1 / (root[both[:, 0], 0] * root[both[:, 1], 0])
+    laplacian = scipy.sparse.identity(count) - scipy.sparse.csr_matrix((between, tuple(both.T)), (count, count))
+    operator = LinearOperator((count, count), lambda x: x + strength * (laplacian @ (laplacian @ x)))
+    middle = values.mean(0)
+    wanted = (values - middle) * root  # the Laplacian of a constant times `root` is 0
+    solved = [cg(operator, column, column, rtol=1e-5)[0] for column in wanted.T.astype(float)]
+    return (np.column_stack(solved) / root + middle).astype(values.dtype)

@@ -82,7 +82,7 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     numbers = {
         "Photographs": f"{len(capture)}"
         + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
-        "PSNR of the photographs": f"{-10 * np.log10(np.mean(errors)):.2f} dB ({made})",
+        "PSNR of the photographs": f"{-10 * np.log10(np.nanmean(errors)):.2f} dB ({made})",
         "Silhouettes": (
             f"{np.mean(masked):.4f} intersection over union with the masks"
             if masked
@@ -140,7 +140,7 @@ def fit_findings(
     if iteration < iterations:
         found.append(f"The fit ended early, at iteration {iteration} of {iterations}: continue it with --resume.")
 
-    typical, scatter = middle([row.psnr for row in rows])
+    typical, scatter = middle([row.psnr for row in rows if not math.isnan(row.psnr)])
     limit = typical - max(LOW_PSNR, 3 * scatter)
     if few := worst((row.psnr, row.name, f"{row.psnr:.1f} dB") for row in rows if row.psnr < limit):
         found.append(f"{few}: far below the others' {typical:.1f} dB; see the difference there. If a longer fit "
@@ -288,7 +288,7 @@ def panel_of(
     for p in result.ring.brdf_net.bsdf_parameters:
         value = (maps[p.name] - p.low) / (white[p.name] - p.low)
         pictures[f"{p.name}, white is {white[p.name]:.2g}"] = linear_to_srgb(value) if p.channels == 3 else value
-    error = float(np.mean((photo - guess)[compared] ** 2))
+    error = float(np.mean((photo - guess)[compared] ** 2)) if compared.any() else math.nan
     by = shift(photo * inside[..., None] if masked else photo, guess, inside | found)
     along, down = shot.window.scale if shot.window else (1.0, 1.0)
     row = PhotographPanel(

@@ -88,9 +88,21 @@ class FineAttribute(mi.Texture):
             name = "factors" if len(self.lattices) == 1 else f"factors_{shape.id()}"
             callback.put(name, lattice.factors, mi.ParamFlags.Differentiable)
 
+    def parameters_changed(self, keys):
+        for shape, lattice in self.lattices.items():
+            needed = 3 * shape.face_count() * points_of(lattice)
+            if (found := dr.width(lattice.factors)) != needed:
+                raise ValueError(f'fine_attribute "{self.attribute}": factors: has {found} numbers, must have {needed}:'
+                                 " three for each point of each triangle's lattice")  # fmt: skip
+
     def to_string(self):
         divisions = ", ".join(str(lattice.divisions) for lattice in self.lattices.values())
         return f'FineAttribute[name="{self.attribute}", divisions=[{divisions}]]'
+
+
+def points_of(lattice):
+    """Return the number of points that a `Lattice` has in each triangle."""
+    return (lattice.divisions + 1) * (lattice.divisions + 2) // 2
 
 
 def factor(lattice, si, active):
@@ -107,7 +119,7 @@ def factor(lattice, si, active):
     result = mi.Color3f(0)
     for a, b, weight in around:
         place = b * (n + 1) - b * (b - 1) // 2 + a
-        index = si.prim_index * ((n + 1) * (n + 2) // 2) + mi.UInt32(place)
+        index = si.prim_index * points_of(lattice) + mi.UInt32(place)
         result += weight * dr.gather(mi.Color3f, lattice.factors, index, active)
     return result
 
