@@ -85,8 +85,8 @@ class Common:
     detail: Literal["none", "texture", "shape", "both"] = "both"
     """What the fit refines at the end, as fine as the pixels of the photographs. The networks alone are smooth.
     texture: colour and gloss, and at the end a texture from the photographs at their own size.
-    shape: displacement of the surface. both: texture and shape.
-    none: neither, which takes less time."""
+    shape: displacement of the surface. both: texture and shape. At least four photographs are needed.
+    none: neither, which takes less time; so do the presets fast and paper."""
     holdout: int = 0
     """Leave every n-th photograph out of the fit and test the result on these photographs. 0: use all photographs.
     For example, 8 leaves out the fifth, the thirteenth, and so on. The fit then has fewer photographs.
