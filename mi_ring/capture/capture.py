@@ -243,12 +243,11 @@ class Capture:
             side = min(self.shots[k].size)
             rgb, over, mask, masked, _ = self.observe([k], max(4 if side >= 16 else 1, side // COARSE))
             inside = mask[0] > 0.5 if masked else rgb[0].mean(-1) > 0.02 * rgb.max()
-            clipped = clipped and bool(over[0][inside].all())
             total, count = total + float(rgb[0][inside].sum()), count + 3 * int(inside.sum())
-        if not total > 0:
-            raise InputError(f"{self.path}: photographs: every pixel of the object is black; check exposure and masks")
-        if clipped:
-            raise InputError(f"{self.path}: photographs: every pixel of the object is over-exposed; take darker ones")
+            clipped &= bool(over[0][inside].all())
+        if clipped or not total > 0:
+            fault = "over-exposed; take darker ones" if total > 0 else "black; check exposure and masks"
+            raise InputError(f"{self.path}: photographs: every pixel of the object is {fault}")
         return total / count
 
     @functools.cached_property
@@ -341,10 +340,7 @@ class Capture:
 
 
 def views_of(shots: Sequence[Shot], valid: Pixels) -> list[MaskedCamera]:
-    """Return the camera of each photograph, with its mask of valid pixels (None: all are valid).
-
-    Both are reduced in size.
-    """
+    """Return the camera of each photograph with its mask of valid pixels (None: all are valid), reduced in size."""
     small: dict[Any, tuple[np.ndarray | None, int]] = {None: (None, 1)}
     for k, reader in enumerate(valid.readers):
         if reader not in small:

@@ -49,12 +49,10 @@ class Fit(Renamed):
             print(it.number, it.loss)
 
     `networks`: (Shape-Net, BRDF-Net) to train instead of the paper's, see `Flow` and `MaterialNet`. `terms`: terms of
-    the loss by name, each a `Term` or a function of an `Iteration`; default: `default_terms`. `callbacks`: functions
-    that are called with each `Iteration` when it is done. `state`: result of `state()` of an interrupted fit, to
-    continue it. `lighting`: result of `choose_lighting`; needed if `config.light` is not "capture". Call
-    `mi_ring.system.machine.set_threads(1)` before a deterministic fit.
-
-    Raises InputError if capture, settings, terms and networks do not go together.
+    the loss by name, each a `Term` or a function of an `Iteration`; default: `default_terms`. `callbacks`: functions of
+    each `Iteration` that is done. `state`: that of an interrupted fit, from `state()`. `lighting`: result of
+    `choose_lighting`; needed if `config.light` is not "capture". Call `mi_ring.system.machine.set_threads(1)` before a
+    deterministic fit. Raises InputError if capture, settings, terms and networks do not go together.
     """
 
     RENAMED = FIT
@@ -80,7 +78,7 @@ class Fit(Renamed):
         self.sampler, self.renderer = Sampler(self.problem), Renderer(self.problem, self.ring)
         self.optimisation = Optimisation(self.problem, self.model)
         self.regulariser, self.course = RegulariserStrength(), Course()
-        self.textured: FittedObject | None = None  #: the object with texture, if the fit is at its end and it was found
+        self.textured: FittedObject | None = None  #: the object with texture, at the end of the fit
         self.capture = self.problem.capture  #: with the masks that are used now
         if state is not None:
             self.restore(copy.deepcopy(state))
@@ -164,16 +162,12 @@ class Fit(Renamed):
     def preview(self, k: int = 0, width: int = 256, level: int = 4, spp: int = 4) -> np.ndarray:
         """Render photograph `k` from the current model. Returns linear radiance (H, W, 3), at most `width` pixels wide.
 
-        `level`: level of the mesh. `spp`: samples per pixel. Do not call it in a term of the loss: it would change the
-        surface that the term's backward pass needs.
+        `level`: of the mesh. `spp`: samples per pixel. Not for terms of the loss: it changes what their gradient needs.
         """
         return self.renderer.picture(self.model, self.calibrated(), k, width, level, spp)
 
     def result(self) -> FitResult:
-        """Collect the results of the fit, for the functions of `mi_ring.output` that write them.
-
-        The texture, which takes long, is found once.
-        """
+        """Collect the results of the fit, for the functions of `mi_ring.output`. A texture is found once."""
         found = result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
                           list(self.loss.terms), self.regulariser.unexplained, self.textured)  # fmt: skip
         self.textured = found.ring if self.iteration == self.iterations else None
@@ -201,5 +195,5 @@ class Fit(Renamed):
                 self.model.calibration.load_state_dict(state["calibration"])
             for name in PARTS:
                 getattr(self, name).restore(state[name])
-            self.course, self.textured = Course.of(state["course"], self.iterations), None
+            self.course = Course.of(state["course"], self.iterations)
             self.capture = with_masks(self.problem.capture, self.course.masks)
