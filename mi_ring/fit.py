@@ -150,7 +150,7 @@ def planned(choice: Sequence[FitConfig], fit: Fit, started: float) -> tuple[FitC
     left = 60 * minutes - spent
     chosen = fitting_into(left, choice, fit.plan, costs)
     if chosen.detail in ("texture", "both"):
-        left -= texture_seconds(fit.problem.given, fit.problem.fitted)
+        left -= texture_seconds(fit.capture, fit.problem.fitted)
         chosen = fitting_into(max(left, fewest_seconds([chosen], fit.plan, costs)), [chosen], fit.plan, costs)
     print(f"In about {minutes:g} minutes: --preset {chosen.preset} --iterations {chosen.iterations} "
           f"--detail {chosen.detail}")  # fmt: skip

@@ -182,7 +182,7 @@ def test_a_photograph_that_is_damaged_before_the_report_is_written(small_capture
     damaged = InputError(f"{small_capture.parent}/images/003.png: filename: is truncated; copy it again")
     monkeypatch.setattr(results, "write", Mock(side_effect=damaged))
     monkeypatch.setattr(keeper, "rescue", Mock())
-    with pytest.raises(InputError, match=r"003\.png: filename: is truncated; .*run has the results but the report"):
+    with pytest.raises(InputError, match=r"003\.png: filename: is truncated; .*run has what could be written"):
         keeper.finish(b"")
     assert not keeper.rescue.called
 

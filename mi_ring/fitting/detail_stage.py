@@ -68,7 +68,7 @@ def add_detail(ring: FittedObject, level: int, resolution: float) -> None:
 def smooth_between(ring: FittedObject, level: int, trained: int) -> None:
     """Let displacements, in place, remove what the flow does between the vertices of the mesh that it was trained with.
 
-    Photographs have not determined it: normals of a mesh one level finer are worse by a quarter. `level`: of the finest
+    Photographs have not determined it. `level`: of the finest
     mesh. `trained`: that of the flow.
     """
     s, faces = ring.domain.sample(level)

@@ -48,14 +48,12 @@ SQUARE = np.ones((3, 3), np.uint8)  #: a pixel and its neighbours
 SLANT = 4  #: exponent of the cosine of the view in the weight of a photograph
 
 
-def chosen_photographs(given: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
+def chosen_photographs(before: Capture, fitted: Sequence[int] | np.ndarray) -> list[int]:
     """Choose photographs for the texture: at most `MOST_PHOTOGRAPHS`, evenly among those of `fitted`.
 
-    Those without a light of their own are left out if there are others: their light is known less well. `given`: the
-    capture before it was reduced for the fit. A photograph of it that is an array and reduced is left out.
+    Those without a light of their own are left out if there are others: their light is known less well.
     """
-    whole = [shot.window is None or shot.files.filename is not None for shot in given.shots]
-    found = [int(k) for k in np.intersect1d(fitted, given.photographs.mainly) if whole[k]]
+    found = np.intersect1d(fitted, before.photographs.mainly).tolist()
     return [found[place] for place in evenly_spaced(len(found), MOST_PHOTOGRAPHS)]
 
 
@@ -69,12 +67,12 @@ def texture_width(before: Capture, index: Sequence[int]) -> int:
     return min(WIDEST, max((max(width, math.ceil(height / HIGHEST)) for width, height in sizes), default=0))
 
 
-def texture_seconds(given: Capture, fitted: Sequence[int] | np.ndarray) -> float:
+def texture_seconds(before: Capture, fitted: Sequence[int] | np.ndarray) -> float:
     """Estimate how long `sharpened` takes [s] on two cores, if it reads no photograph twice.
 
     The arguments are those of `chosen_photographs`.
     """
-    return sum(0.5 + 4e-8 * math.prod(given.shots[k].whole.size) for k in chosen_photographs(given, fitted))
+    return sum(0.5 + 4e-8 * math.prod(before.shots[k].whole.size) for k in chosen_photographs(before, fitted))
 
 
 def at_width(given: Shot, refined: Shot, width: int) -> tuple[Shot, Shot]:
@@ -194,7 +192,7 @@ def sharpened(
     after calibration. `surface`: shows the object `ring`, in the light of the fit. `fitted`: indices of the photographs
     to use. `width`: of the photographs in the last stage of the fit [px]. Raises InputError if a file cannot be read.
     """
-    index = chosen_photographs(given, fitted)
+    index = chosen_photographs(before, fitted)
     widest, albedo = texture_width(before, index), ring.brdf_net.albedo
     if not widest or not albedo:
         return ring

@@ -170,7 +170,7 @@ class Fit(Renamed):
         """Collect the results of the fit, for the functions of `mi_ring.output`. A texture is found once."""
         found = result_of(self.problem, self.model, self.renderer, self.schedule, self.course, self.capture,
                           list(self.loss.terms), self.regulariser.unexplained, self.textured)  # fmt: skip
-        self.textured = found.ring if self.iteration == self.iterations else None
+        self.textured = found.ring if found.ring is not self.ring else None
         return found
 
     def save(self, folder: str | Path) -> None:

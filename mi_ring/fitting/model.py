@@ -65,7 +65,7 @@ class Model(nn.Module):
         return isinstance(self.ring.shape_net, DetailedFlow) and isinstance(self.ring.brdf_net, DetailedMaterial)
 
     def add_detail(self, level: int, trained: int) -> None:
-        """Add details to both networks, and freeze the networks.
+        """Add details to both networks, and freeze the networks. Displacements begin with what smooths the flow.
 
         `level`: of the finest mesh. `trained`: that with which the networks were trained.
         """

@@ -42,7 +42,7 @@ class Problem:
         A deterministic fit changes the normals of the scene's meshes.
 
         `lighting`: the light that the fit assumes. `usual_loss`: its terms `rgb` and `mask` are the default ones.
-        Raises InputError if no photograph is left to fit, or if the object is black in all photographs.
+        Raises InputError if no photograph is left to fit, or if the object is black, or clipped, in all photographs.
         """
         if config.deterministic:
             recompute_normals(capture.scene)

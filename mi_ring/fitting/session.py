@@ -122,9 +122,10 @@ class Keeper:
             results.write(self.folder, result, fitted_scene)
         except (InputError, OSError) as error:
             what = str(error).partition(";")[0]
-            if not what.startswith(str(self.folder)) and any(Path(file).name in what for file in self.files):
-                raise InputError(f"{what}; {self.folder} has the results but the report: restore the file, then the "
-                                 "same command and --resume") from error  # fmt: skip
+            path = Path(what.partition(":")[0])
+            if not path.is_relative_to(self.folder) and path.name in {Path(file).name for file in self.files}:
+                raise InputError(f"{what}; {self.folder} has what could be written: restore the file, then the same "
+                                 "command and --resume") from error  # fmt: skip
             raise InputError(f"{what}; {self.rescue(result, fitted_scene)}") from error
 
     def warn_of_changes(self) -> None:
@@ -214,7 +215,7 @@ def resume_hint(folder: Path) -> Iterator[None]:
 def details_missing(fit: Fit) -> str:
     """Say why a fit that should find details finds none, for the user. Empty if it does, or if none are wanted."""
     config = fit.problem.config
-    if config.detail == "none" or fit.schedule.stages[-1].detail:
+    if config.detail == "none" or not config.detail_share or fit.schedule.stages[-1].detail:
         return ""
     if fit.model.detail_levels:
         return f"{config.iterations} iterations are too few (--iterations, --detail-share)"
