@@ -10,7 +10,7 @@ from mi_ring.fitting.problem import Problem
 from mi_ring.geometry.camera import pixels_per_unit
 from mi_ring.geometry.meshes import area_of, area_vectors, smoothed
 from mi_ring.nets.registry import is_registered
-from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
+from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid, corner_values
 from mi_ring.objects.fitted_object import FittedObject
 from mi_ring.objects.ring_file import MAX_LEVEL
 
@@ -79,12 +79,9 @@ def smooth_between(ring: FittedObject, level: int, trained: int) -> None:
     points = flow.base(s, 1.0).cpu()
     change = smoothed(points.numpy(), faces, STIFFNESS * ratio**4) - points.numpy()
     normals = trimesh.Trimesh(points.numpy(), faces, process=False).vertex_normals
-    wanted = (change * normals).sum(1).astype(np.float32) / flow.grid.cells[-1]
-    weights, values = flow.grid.weights(s)[-1], flow.grid.values[-1]
-    nodes, total = np.zeros(len(values), np.float32), np.maximum(weights.T @ np.ones(len(s), np.float32), 1e-6)
-    for _ in range(SOLVING):  # for values of the corners whose interpolation is `wanted`
-        nodes += weights.T @ (wanted - weights @ nodes) / total
-    values.copy_(torch.from_numpy(nodes)[:, None])
+    wanted = (change * normals).sum(1, keepdims=True).astype(np.float32) / flow.grid.cells[-1]
+    nodes = corner_values(flow.grid.weights(s)[-1], wanted, np.ones(len(s), np.float32), SOLVING)
+    flow.grid.values[-1].copy_(torch.from_numpy(nodes))
 
 
 def share_weights(ring: FittedObject) -> None:

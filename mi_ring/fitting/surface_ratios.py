@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from mi_ring.objects.detail import Grid
+from mi_ring.objects.detail import Grid, corner_values
 
 SOLVING = 4  #: steps to find the values of the corners of a grid
 CERTAIN = 0.05  #: least share of the ratios that halves of the photographs have in common
@@ -99,11 +99,8 @@ class Ratios:
         shown = weights > 0
         at, values, weights = torch.from_numpy(self.points.at(s.numpy())[shown]), values[shown], weights[shown]
         grid = Grid.around(at, fine, 1, 3)
-        (shares,), nodes = grid.weights(at), np.zeros((len(grid.keys(0)), 3), np.float32)
-        total = np.maximum(shares.T @ weights, 1e-12)[:, None]
-        for _ in range(SOLVING):  # for values of the corners whose interpolation is `values`
-            nodes += shares.T @ ((values - shares @ nodes) * weights[:, None]) / total
-        grid.values[0].copy_(torch.from_numpy(nodes))
+        (shares,) = grid.weights(at)
+        grid.values[0].copy_(torch.from_numpy(corner_values(shares, values, weights, SOLVING)))
         grid.latest.clear()  # the weights take more memory than the values
         return grid
 

@@ -145,6 +145,18 @@ class _Product(torch.autograd.Function):
         return torch.from_numpy(ctx.matrix.T @ gradient.numpy(force=True)).to(gradient.device), None
 
 
+def corner_values(shares: scipy.sparse.csr_matrix, wanted: np.ndarray, weights: np.ndarray, steps: int) -> np.ndarray:
+    """Find values (N, C) of the corners of an octave whose interpolation is `wanted` (V, C), by some `steps`.
+
+    `shares` (V, N): what `Grid.weights` returns for the octave. `weights` (V,): how much each point counts.
+    """
+    nodes = np.zeros((shares.shape[1], wanted.shape[1]), np.float32)
+    total = np.maximum(shares.T @ weights, 1e-12)[:, None]
+    for _ in range(steps):
+        nodes += shares.T @ ((wanted - shares @ nodes) * weights[:, None]) / total
+    return nodes
+
+
 def wants_gradient(s: Tensor) -> bool:
     """Return True if a gradient with respect to the points `s` is wanted. In a fit it is not."""
     return s.requires_grad and torch.is_grad_enabled()
