@@ -19,6 +19,7 @@ from mi_ring.fitting.fit import Fit
 from mi_ring.fitting.optimisation import detail_steppers
 from mi_ring.fitting.schedule import Schedule
 from mi_ring.geometry.domain import Domain, Sphere
+from mi_ring.geometry.meshes import smoothed
 from mi_ring.nets.brdf_net import COOK_TORRANCE, BRDFNet
 from mi_ring.objects import detail
 from mi_ring.objects.detail import DetailedFlow, DetailedMaterial, Grid
@@ -167,6 +168,20 @@ def test_what_the_flow_does_between_trained_vertices_is_taken_away(trained):
     middle = s[:, 2].abs() < 0.5  # elsewhere waves along z are longer on the surface
     solved = torch.linalg.lstsq(torch.stack(waves, 1)[middle], left[middle, None]).solution
     assert abs(float(solved[0])) < 0.35 and float(solved[1]) == pytest.approx(1, abs=0.1)
+
+
+def test_smoothing_of_a_cone_is_a_dense_solution():
+    """Its vertices have unequal triangles and degrees, unlike those of the sphere."""
+    mesh = trimesh.creation.cone(0.5, 1.5, sections=11).subdivide()
+    assert mesh.is_watertight and len({*mesh.vertex_degree}) > 2
+    linked = np.zeros((len(mesh.vertices),) * 2)
+    for a, b in mesh.edges:
+        linked[a, b] = linked[b, a] = 1
+    root = np.sqrt(linked.sum(1))
+    laplacian = np.eye(len(linked)) - linked / np.outer(root, root)
+    middle = mesh.vertices.mean(0)
+    solved = np.linalg.solve(np.eye(len(linked)) + 3 * laplacian @ laplacian, root[:, None] * (mesh.vertices - middle))
+    np.testing.assert_allclose(smoothed(mesh.vertices, mesh.faces, 3.0), solved / root[:, None] + middle, atol=1e-7)
 
 
 def test_displacement_is_along_the_normal_in_cells():

@@ -137,6 +137,14 @@ def test_an_obj_has_the_print(run, tmp_path):
                        s[corners[..., 0].ravel()])  # fmt: skip
     library = dict(line.split(maxsplit=1) for line in (tmp_path / "o.mtl").read_text().splitlines())
     assert has_the_print(ring, Image.open(tmp_path / library["map_Kd"]), at, s)
+    assert "norm" not in library  # the mesh has all of the relief
+
+
+def test_an_obj_of_a_coarse_mesh_has_a_normal_map(run, tmp_path):
+    export.main([str(run), str(tmp_path / "o.obj"), "--subdivisions", "3", "--resolution", "256"])
+    library = dict(line.split(maxsplit=1) for line in (tmp_path / "o.mtl").read_text().splitlines())
+    across = np.asarray(Image.open(tmp_path / library["norm"]))[..., :2]
+    assert np.ptp(across, axis=(0, 1)).min() > 20
 
 
 @pytest.mark.parametrize("time", [1.0, 0.5])

@@ -100,7 +100,9 @@ class Ratios:
         at, values, weights = torch.from_numpy(self.points.at(s.numpy())[shown]), values[shown], weights[shown]
         grid = Grid.around(at, fine, 1, 3)
         (shares,) = grid.weights(at)
-        grid.values[0].copy_(torch.from_numpy(corner_values(shares, values, weights, SOLVING)))
+        found = corner_values(shares, values, weights, SOLVING)
+        found = found.clip(values.min(0), values.max(0))  # a corner beside few points may be far off
+        grid.values[0].copy_(torch.from_numpy(found))
         grid.latest.clear()  # the weights take more memory than the values
         return grid
 

@@ -138,15 +138,17 @@ def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
     """Convert a material to textures. Returns uint8 arrays (H, W, 3 or 4), with glTF's names as keys.
 
     `material`: the material at the N points of `texels`. `texels`: these points, and which of them each pixel shows.
-    Base colours are encoded as sRGB, other values linearly.
+    Base colours are encoded as sRGB, other values linearly. There is no normal map if the mesh has all of the detail.
     """
     ones = np.ones_like(material.roughness)
     images = {
         "baseColorTexture": to_bytes(linear_to_srgb(material.base_color)),
         "metallicRoughnessTexture": to_bytes(np.stack([ones, material.roughness, material.metallic], 1)),
         "specularTexture": to_bytes(np.stack([ones, ones, ones, material.specular], 1)),
-        "normalTexture": to_bytes(0.5 * texels.normals + 0.5),
     }
+    normals = to_bytes(0.5 * texels.normals + 0.5)
+    if np.ptp(normals, axis=0).any():
+        images["normalTexture"] = normals
     if material.coat is not None and material.coat_roughness is not None:
         images["clearcoatTexture"] = to_bytes(np.stack([material.coat, material.coat_roughness, 0 * ones], 1))
     return {name: image[texels.index] for name, image in images.items()}
@@ -238,7 +240,7 @@ def assemble_glb(
         pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
             baseColorTexture=texture("baseColorTexture"), metallicRoughnessTexture=texture("metallicRoughnessTexture")
         ),
-        normalTexture=texture("normalTexture", pygltflib.NormalMaterialTexture),
+        normalTexture=texture("normalTexture", pygltflib.NormalMaterialTexture) if "normalTexture" in images else None,
         extensions=extensions,
         extras={"mi_ring": {"bsdf": bsdf, "scale": material.scale}},
     )  # fmt: skip

@@ -19,11 +19,13 @@ def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material)
     """
     baked, files = gltf.textures(material, texels), {}
     for name, image in {
-        "diffuse": baked["baseColorTexture"], "normal": baked["normalTexture"],
+        "diffuse": baked["baseColorTexture"], "normal": baked.get("normalTexture"),
         "specular": baked["specularTexture"][..., 3, None],
         "roughness": baked["metallicRoughnessTexture"][..., 1, None],
         "metallic": baked["metallicRoughnessTexture"][..., 2, None],
     }.items():  # fmt: skip
+        if image is None:
+            continue
         files[name] = path.with_name(f"{path.stem}_{name}.png")
         write_image(image, files[name])
     library, coat = path.with_suffix(".mtl"), []
@@ -33,7 +35,7 @@ def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material)
         "newmtl fitted", "illum 2", "Kd 1 1 1", f"map_Kd {files['diffuse'].name}",
         "Ks {0:.4g} {0:.4g} {0:.4g}".format(min(0.04 * material.specular_color, 1)), f"map_Ks {files['specular'].name}",
         "Pr 1", f"map_Pr {files['roughness'].name}", "Pm 1", f"map_Pm {files['metallic'].name}",
-        f"norm {files['normal'].name}", *coat, "",
+        *[f"norm {files[name].name}" for name in files if name == "normal"], *coat, "",
     ]))  # fmt: skip
     _, first, uncut = np.unique(atlas.uncut, return_index=True, return_inverse=True)
     corners = np.stack([uncut, np.arange(len(uncut)), uncut], 1)[atlas.faces] + 1

@@ -73,7 +73,8 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     panels = [panel for *_, panel in sorted(zip(cameras, shown, chain(*parts)), key=lambda entry: entry[:2])]
     rows = [row for row, _ in panels]
     fitted, errors = zip(*([panel for panel in panels if not panel[0].held_out] or panels))  # all may be held out
-    masked = [row.iou for row in fitted if row.iou is not None]
+    known = [error for error in errors if not math.isnan(error)]
+    masked, overlap = [row.iou for row in fitted if row.iou is not None], "intersection over union with the masks"
     pixels = "the object's pixels" if capture.lit_room else "all pixels"
     s, faces = ring.domain.sample(ring.subdivisions)
     made = f"sRGB, {pixels}, 4 samples each"
@@ -82,12 +83,8 @@ def report_html(result: FitResult, glb: bytes | None = None, unseen: float | Non
     numbers = {
         "Photographs": f"{len(capture)}"
         + (f"; below are {len(rows)} of them, as are the next two numbers" if len(rows) < len(capture) else ""),
-        "PSNR of the photographs": f"{-10 * np.log10(np.nanmean(errors)):.2f} dB ({made})",
-        "Silhouettes": (
-            f"{np.mean(masked):.4f} intersection over union with the masks"
-            if masked
-            else "no masks of the whole object"
-        ),
+        "PSNR of the photographs": f"{-10 * np.log10(np.mean(known)):.2f} dB ({made})" if known else "no valid pixels",
+        "Silhouettes": f"{np.mean(masked):.4f} {overlap}" if masked else "no masks of the whole object",
         "Iterations": f"{result.iteration} of {result.iterations}",
         "Fit time": f"{result.seconds:.0f} s",
         **({"Photographs kept out": held_out_text(result.validation)} if len(result.held_out) else {}),
