@@ -17,7 +17,7 @@ from mi_ring.capture.pixels import Pixels
 from mi_ring.capture.reduction import reduced
 from mi_ring.fitting import fine_texture
 from mi_ring.fitting.config import Config
-from mi_ring.fitting.surface_ratios import Comparison, LowPass, Points, Ratios, bilinear
+from mi_ring.fitting.surface_ratios import LowPass, PatchRatios, Points, Ratios, bilinear
 from mi_ring.fitting.validation import texture_helps
 from mi_ring.nets.brdf_net import BRDFNet, Parameter
 from mi_ring.objects.detail import Grid
@@ -338,7 +338,7 @@ def test_what_disagrees_is_trusted_less():
     sphere = trimesh.creation.icosphere(4)
     points, rng = Points.of(sphere.faces, 1), np.random.default_rng(1)
     true = rng.normal(size=(len(sphere.faces), 1, 3))
-    comparison, triangles = Comparison(points, sphere.vertices, 6), np.arange(len(sphere.faces))
+    patches, triangles = PatchRatios(points, sphere.vertices, 6), np.arange(len(sphere.faces))
     for k in range(6):
         found = true + 0.05 * rng.normal(size=true.shape)
         if k == 3:
@@ -346,8 +346,8 @@ def test_what_disagrees_is_trusted_less():
         if k == 4:
             found += 0.1 * sphere.triangles_center[:, None, 2:]
         for part in np.array_split(triangles, 3):
-            comparison.add(k, part, found[part], np.ones((len(part), 1)))
-    assert comparison.trust().tolist() == pytest.approx([1, 1, 1, 0.01, 1, 1])
+            patches.add(k, part, found[part], np.ones((len(part), 1)))
+    assert patches.trust().tolist() == pytest.approx([1, 1, 1, 0.01, 1, 1])
 
 
 def test_a_label_and_a_sharp_minority_are_no_reason_to_doubt():
@@ -356,7 +356,7 @@ def test_a_label_and_a_sharp_minority_are_no_reason_to_doubt():
     points, rng = Points.of(sphere.faces, 1), np.random.default_rng(2)
     centres, count = sphere.triangles_center, 24
     printed = centres[:, 2] > 0.5
-    labelled, sharp = (Comparison(points, sphere.vertices, count) for _ in range(2))
+    labelled, sharp = (PatchRatios(points, sphere.vertices, count) for _ in range(2))
     true = rng.normal(size=(len(sphere.faces), 1, 3))
     for k in range(count):
         toward = rng.normal(size=3)
@@ -372,20 +372,20 @@ def test_a_label_and_a_sharp_minority_are_no_reason_to_doubt():
 
 def test_equal_photographs_are_trusted(recwarn):
     sphere = trimesh.creation.icosphere(3)
-    comparison, everywhere = Comparison(Points.of(sphere.faces, 1), sphere.vertices, 4), np.arange(len(sphere.faces))
+    patches, everywhere = PatchRatios(Points.of(sphere.faces, 1), sphere.vertices, 4), np.arange(len(sphere.faces))
     for k in range(4):
-        comparison.add(k, everywhere, np.ones((len(everywhere), 1, 3)), np.ones((len(everywhere), 1)))
-    assert comparison.trust().tolist() == [1, 1, 1, 1]
+        patches.add(k, everywhere, np.ones((len(everywhere), 1, 3)), np.ones((len(everywhere), 1)))
+    assert patches.trust().tolist() == [1, 1, 1, 1]
     assert not recwarn
 
 
 def test_what_cannot_be_compared_is_trusted():
     sphere = trimesh.creation.icosphere(3)
-    comparison = Comparison(Points.of(sphere.faces, 1), sphere.vertices, 4)
-    comparison.add(0, np.arange(0), np.zeros((0, 1, 3)), np.zeros((0, 1)))
+    patches = PatchRatios(Points.of(sphere.faces, 1), sphere.vertices, 4)
+    patches.add(0, np.arange(0), np.zeros((0, 1, 3)), np.zeros((0, 1)))
     for k in (1, 2):
-        comparison.add(k, np.arange(500), np.random.default_rng(k).normal(size=(500, 1, 3)), np.ones((500, 1)))
-    assert comparison.trust().tolist() == [1, 1, 1, 1]
+        patches.add(k, np.arange(500), np.random.default_rng(k).normal(size=(500, 1, 3)), np.ones((500, 1)))
+    assert patches.trust().tolist() == [1, 1, 1, 1]
 
 
 def test_what_both_halves_show_is_taken_but_not_what_is_coarse():

@@ -21,7 +21,7 @@ from mi_ring.capture.capture import Capture
 from mi_ring.capture.decoding import read_photograph
 from mi_ring.capture.observation import Observation, observed
 from mi_ring.capture.reduction import HIGHEST, reduced_image, windowed
-from mi_ring.fitting.surface_ratios import Comparison, Points, Ratios, bilinear
+from mi_ring.fitting.surface_ratios import PatchRatios, Points, Ratios, bilinear
 from mi_ring.geometry.camera import pixels_per_unit
 from mi_ring.geometry.hull import evenly_spaced
 from mi_ring.geometry.meshes import area_of
@@ -206,7 +206,7 @@ def sharpened(
     wanted = resolution * math.sqrt(area / len(faces))  # divisions of a triangle, for one point in each pixel
     divisions = max(1, min(math.ceil(wanted), math.isqrt(MOST_POINTS // len(faces))))
     ratios = Ratios(Points.of(faces, divisions))
-    comparison, trust = Comparison(ratios.points, predictor.s.numpy(), len(index)), np.ones(len(index))
+    patches, trust = PatchRatios(ratios.points, predictor.s.numpy(), len(index)), np.ones(len(index))
 
     def predicted(k: int) -> Expected:
         release_memory()  # of the photograph before
@@ -228,11 +228,11 @@ def sharpened(
             weight = usable * ratios.points.at(weights[:, None], part)[..., 0]
             ratios.add(number % 2, part, logarithms, weight * factor)
             if not again:
-                comparison.add(number, part, logarithms, weight)
+                patches.add(number, part, logarithms, weight)
 
     for _ in progress(pipelined(predicted, compare, index), "texture", len(index)):
         pass
-    trust = comparison.trust()
+    trust = patches.trust()
     doubtful = [k for k, share in zip(index, trust) if share < 1]
     for _ in progress(pipelined(predicted, compare, doubtful), "texture: photographs that disagree", len(doubtful)):
         pass

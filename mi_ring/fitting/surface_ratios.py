@@ -129,7 +129,7 @@ class Ratios:
         return share * (means * self.weights[..., None]).sum(0) / np.maximum(total, 1e-9)[..., None]
 
 
-class Comparison:
+class PatchRatios:
     """Ratios of each photograph in small patches of a surface. They show which photographs disagree with the others.
 
     `points`: those of the ratios; the first one in a triangle is used. `s` (V, 3): vertices on the domain. `count`:
