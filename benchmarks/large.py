@@ -1,6 +1,7 @@
 """What large photographs, or a very fine mesh, cost in time and memory (Linux).
 
     python benchmarks/large.py CAPTURE.xml [--count 66] [--size 4000] [--share 0.65] [--light] [--out out/large]
+    python benchmarks/large.py CAPTURE.xml --preset default [--count 66] [--size 4000] [--share 0.65] [--out out/large]
     python benchmarks/large.py RUN [--level 9] [--out out/large]
 
 The first writes photographs of --size × --size pixels: those of the capture are scaled so that their width is --share
