@@ -7,7 +7,8 @@
 The first writes photographs of --size × --size pixels: those of the capture are scaled so that their width is --share
 of the frame, and used again and again. Then each command runs in a process of its own: `fit --preset fast` to its first
 iteration with an empty cache, and again; `mi-ring check` with this cache and with an empty one; all of `fit --preset
-fast`, and with --light of `fit --preset fast --light auto`. The second exports a finished fit as PLY.
+fast`, and with --light of `fit --preset fast --light auto`. The second is all of a fit with another preset, with details and
+without. The third exports a finished fit as PLY.
 
 Prints wall time, processor time and peak memory of each process, with machine and date.
 """
@@ -117,6 +118,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=4000)
     parser.add_argument("--share", type=float, default=0.65)
     parser.add_argument("--light", action="store_true")
+    parser.add_argument("--preset", default="fast")
     parser.add_argument("--level", type=int, default=9)
     parser.add_argument("--out", type=Path, default=Path("out/large"))
     options = parser.parse_args()
@@ -133,12 +135,16 @@ def main() -> None:
         row("export", "-m", "mi_ring.export", options.source, mesh, "--subdivisions", str(options.level), cache=cache)
         mesh.unlink()
         return
+    run = "-m", "mi_ring.fit", scene, "--preset", options.preset, "--out", out / "run"
+    if options.preset != "fast":
+        row(f"`fit --preset {options.preset}`", *run, cache=cache)
+        row("the same with `--detail none`, photographs in the cache", *run, "--detail", "none", cache=cache)
+        return
     row("`fit --preset fast`, first iteration", "-c", FIRST_ITERATION, scene, cache=cache)
     row("the same again", "-c", FIRST_ITERATION, scene, cache=cache)
     row("`check`, photographs in the cache", "-m", "mi_ring.check", scene, "--out", out / "check.png", cache=cache)
     shutil.rmtree(cache, ignore_errors=True)
     row("`check`", "-m", "mi_ring.check", scene, "--out", out / "check.png", cache=cache)
-    run = "-m", "mi_ring.fit", scene, "--preset", "fast", "--out", out / "run"
     row("`fit --preset fast`, all of it", *run, cache=cache)
     if options.light:
         row("`fit --preset fast --light auto`, all of it", *run, "--light", "auto", cache=cache)
