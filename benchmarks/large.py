@@ -7,8 +7,8 @@
 The first writes photographs of --size × --size pixels: those of the capture are scaled so that their width is --share
 of the frame, and used again and again. Then each command runs in a process of its own: `fit --preset fast` to its first
 iteration with an empty cache, and again; `mi-ring check` with this cache and with an empty one; all of `fit --preset
-fast`, and with --light of `fit --preset fast --light auto`. The second is all of a fit with another preset, with details
-and without. The third exports a finished fit as PLY.
+fast`, and with --light of `fit --preset fast --light auto`. The second is all of a fit with another preset,
+with details and without. The third exports a finished fit as PLY.
 
 Prints wall time, processor time and peak memory of each process, with machine and date.
 """
