@@ -117,7 +117,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=66)
     parser.add_argument("--size", type=int, default=4000)
     parser.add_argument("--share", type=float, default=0.65)
-    parser.add_argument("--light", action="store_true")
+    parser.add_argument("--light", action="store_true", help="with the preset `fast`")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--level", type=int, default=9)
     parser.add_argument("--out", type=Path, default=Path("out/large"))

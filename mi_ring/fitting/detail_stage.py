@@ -68,8 +68,8 @@ def add_detail(ring: FittedObject, level: int, resolution: float) -> None:
 def smooth_between(ring: FittedObject, level: int, trained: int) -> None:
     """Let displacements, in place, remove what the flow does between the vertices of the mesh that it was trained with.
 
-    Photographs have not determined it. `level`: of the finest
-    mesh. `trained`: that of the flow.
+    Photographs have not determined it. `level`: of the finest mesh. `trained`: that of the mesh of the flow. Where a
+    cube has no direction, because the object is thin, nothing is removed.
     """
     s, faces = ring.domain.sample(level)
     s = s.to(ring.center.device)

@@ -5,6 +5,8 @@ the powers, the surface explains a part of them, where few photographs see it. S
 anything of either. The joint equations tell what explains all photographs together.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -30,8 +32,12 @@ SIDES = 0.3  #: standard deviation of the other harmonics of a room, as a share 
 
 
 @torch.no_grad()
-def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int) -> dict[str, Tensor]:
+def solve_jointly(
+    problem: Problem, model: Model, renderer: Renderer, level: int, known: Collection[str] = ()
+) -> dict[str, Tensor]:
     """Find the room beside other light. If a flash is the only other light and varies, find those of `SOLVED`, too.
+
+    `known`: those that stay as they are.
 
     Returns new values of the calibration: a dict from names of unknowns to tensors in the shape of the unknown, in
     units of its prior; of "ambient" the harmonics (BASIS, 3), of which a part is `believed`. It is empty if no
@@ -42,7 +48,8 @@ def solve_jointly(problem: Problem, model: Model, renderer: Renderer, level: int
     room, rig = calibration.room, calibration.rig
     # With other lights the derivatives by a power would be those of all light.
     exposure = calibration.exposure_of_flash
-    names = [name for name in ("light", exposure) if name in calibration.unknowns] if exposure else []
+    sought = [name for name in ("light", exposure) if name not in known] if exposure else []
+    names = [name for name in sought if name in calibration.unknowns]
     if not (names or "ambient" in calibration.refined):
         return {}
     most = None if names else MOST

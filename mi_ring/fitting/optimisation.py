@@ -16,6 +16,7 @@ from mi_ring.fitting.brightness_solver import BrightnessSolver
 from mi_ring.fitting.config import Config
 from mi_ring.fitting.detail_stage import unfold
 from mi_ring.fitting.exposure_solver import ExposureSolver
+from mi_ring.fitting.flash_search import find_flash
 from mi_ring.fitting.iteration import Iteration
 from mi_ring.fitting.joint_solver import SOLVED, solve_jointly
 from mi_ring.fitting.model import Model
@@ -205,7 +206,15 @@ class Optimisation:
         level, progress = schedule.stage(iteration).level, schedule.progress(iteration)
         one_material = progress < problem.lighting.one_material_until  # the joint equations have many materials
         if schedule.joint_due(iteration) and not (calibration.room.alone or one_material):
-            values = problem.processes.on_first(lambda: solve_jointly(problem, self.model, renderer, level))
+            sought = schedule.flash_due(iteration)
+            place = (
+                problem.processes.on_first(lambda: find_flash(problem, self.model, renderer, level)) if sought else None
+            )
+            known = {} if place is None else {"light": place}
+            for name, value in known.items():
+                calibration.get_parameter(name).data.copy_(value)
+            joint = problem.processes.on_first(lambda: solve_jointly(problem, self.model, renderer, level, known))
+            values = joint | known
             if not values:
                 return
             for name, value in values.items():

@@ -17,6 +17,7 @@ MASKS_REFINED = 0.5, 0.75  #: progress at which masks are found anew, if they ar
 #: Progress at which small lights of an unknown room are sought: when harmonics have their full order, and later.
 LIGHTS_SOUGHT = 0.36, 0.5, 0.65, 0.8
 JOINTLY_SOLVED = 0.3, 0.6  #: progress at which a room beside other light, flash and exposures are found together
+FLASH_SOUGHT = 0.6  #: the one of them before which highlights tell the flash's place: earlier the surface is too coarse
 COAT_DECIDED = 0.5  #: progress at which a fit decides about a second lobe of highlights
 #: Iterations before light is sought or a coat decided: in shorter fits surface and material are too wrong.
 EARLIEST = 20
@@ -121,6 +122,10 @@ class Schedule:
     def joint_due(self, iteration: int) -> bool:
         """Test whether lights and exposures are found together before `iteration`, if any of them is refined."""
         return iteration >= EARLIEST and self.reaches(JOINTLY_SOLVED, iteration)
+
+    def flash_due(self, iteration: int) -> bool:
+        """Test whether highlights are to tell the place of the flash before `iteration`, if it is refined."""
+        return self.joint_due(iteration) and self.reaches([FLASH_SOUGHT], iteration)
 
     def coat_due(self, iteration: int) -> bool:
         """Test whether the fit decides before `iteration`, counted from 0, whether the material has a coat."""

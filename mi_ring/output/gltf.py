@@ -147,7 +147,7 @@ def textures(material: Material, texels: Texels) -> dict[str, np.ndarray]:
         "specularTexture": to_bytes(np.stack([ones, ones, ones, material.specular], 1)),
     }
     normals = to_bytes(0.5 * texels.normals + 0.5)
-    if np.ptp(normals, axis=0).any():
+    if np.ptp(normals, axis=0).max() > 1:  # not rounding alone
         images["normalTexture"] = normals
     if material.coat is not None and material.coat_roughness is not None:
         images["clearcoatTexture"] = to_bytes(np.stack([material.coat, material.coat_roughness, 0 * ones], 1))

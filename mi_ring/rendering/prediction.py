@@ -1,7 +1,7 @@
 """Renders photographs of a surface as tensors: with gradients for a fit, without gradients for pictures and maps."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 
 import mitsuba as mi
@@ -125,15 +125,24 @@ def draw(
 
 
 @contextmanager
-def without_gloss(surface: Surface) -> Iterator[None]:
-    """Show the surface without highlights."""
-    names = [f"vertex_{name}" for name in SPECULAR if surface.prefix + f"vertex_{name}" in surface.params]
-    gloss = {name: mi.Float(surface.params[surface.prefix + name]) for name in names}  # not references
-    surface.write_arrays({name: 0 * value for name, value in gloss.items()})
+def with_material(surface: Surface, values: Mapping[str, float]) -> Iterator[None]:
+    """Show the surface with these parameters of its BSDF, the same everywhere; those that it does not have are ignored.
+
+    `values`: numbers by name, such as "roughness".
+    """
+    wanted = {f"vertex_{name}": value for name, value in values.items()}
+    own = {name: mi.Float(surface.params[surface.prefix + name])  # not references
+           for name in wanted if surface.prefix + name in surface.params}  # fmt: skip
+    surface.write_arrays({name: 0 * value + wanted[name] for name, value in own.items()})
     try:
         yield
     finally:
-        surface.write_arrays(gloss)
+        surface.write_arrays(own)
+
+
+def without_gloss(surface: Surface) -> AbstractContextManager[None]:
+    """Show the surface without highlights."""
+    return with_material(surface, dict.fromkeys(SPECULAR, 0.0))
 
 
 def maps(

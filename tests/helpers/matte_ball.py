@@ -20,14 +20,14 @@ def plain(points):
     return np.tile(PALE, (len(points), 1))
 
 
-def photographed(folder, colours, count=12, surface=lambda points: points, width=160, aside=0.4):
+def photographed(folder, colours, count=12, surface=lambda points: points, width=160, aside=0.4, gloss=None):
     """A scene file with photographs of a matte ball in a dark room, which Mitsuba's path tracer makes.
 
     `colours`, `surface`: functions of points (V, 3) of the unit sphere, reflectances and places. `aside`: distance of
-    the flash from the lens.
+    the flash from the lens. `gloss`: a BSDF of Mitsuba that covers half of it.
     """
     ico = trimesh.creation.icosphere(6)
-    mesh = mi.Mesh("ball", len(ico.vertices), len(ico.faces), props=matte())
+    mesh = mi.Mesh("ball", len(ico.vertices), len(ico.faces), props=mesh_props(gloss))
     params = mi.traverse(mesh)
     params["vertex_positions"] = surface(ico.vertices).ravel().astype(np.float32)
     params["faces"] = ico.faces.ravel().astype(np.uint32)
@@ -48,11 +48,11 @@ def photographed(folder, colours, count=12, surface=lambda points: points, width
     return folder / "scene.xml"
 
 
-def matte():
+def mesh_props(gloss):
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict(
-        {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}
-    )
+    matte = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}
+    blend = {"type": "blendbsdf", "weight": 0.5, "matte": matte}
+    props["bsdf"] = mi.load_dict(blend | {"gloss": gloss} if gloss else matte)
     return props
 
 
