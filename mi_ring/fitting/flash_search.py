@@ -34,7 +34,7 @@ NARROW, WIDE = 0.15, 0.35  #: roughness of the highlights that are tried, and of
 NEAR = 0.2  #: least brightness of the wide one there, relative to its maximum: about 27° from it
 COARSE = 0.1  #: standard deviation of the blur that is subtracted [square root of the number of pixels]
 DIM = 0.3  #: radiance that is added before logarithms [exposure]: dark pixels count less
-SHARE = 0.004  #: the flash is moved if highlights there explain at least this share of the squared error,
+SHARE = 0.015  #: the flash is moved if highlights there explain at least this share of the squared error,
 FACTOR = 1.2  #: so much more than those of the current flash, in each half of the photographs, too,
 NEAREST = 0.1  #: and if it is so far away: gradients find nearer places [distance of the object]
 
@@ -47,6 +47,7 @@ class Part(NamedTuple):
     inside: Tensor  #: (n, H, W) bool: which pixels are compared
     predicted: Tensor  #: (n, H, W) predicted radiance, and `DIM` [exposure]
     lacking: Tensor  #: (n, H, W) logarithm of what it lacks
+    weights: Tensor  #: (n, 1, 1) so that each photograph has the same squared error
 
 
 class Subset(NamedTuple):
@@ -107,7 +108,9 @@ class FlashSearch:
         inside &= wide > NEAR * wide.amax((1, 2), keepdim=True)
         observed = calibration.linear(seen.rgb, index, scale).mean(-1) / unit
         predicted = whole.mean(-1) / unit + DIM
-        return Part(index, scale, inside, predicted, torch.log(observed.clamp(min=-DIM / 2) + DIM) - predicted.log())
+        lacking = torch.log(observed.clamp(min=-DIM / 2) + DIM) - predicted.log()
+        squares = fine(lacking, inside).square().sum((1, 2), keepdim=True)
+        return Part(index, scale, inside, predicted, lacking, squares.clamp(min=1e-12) ** -0.5)
 
     def photographs(self, index: np.ndarray, views: Views, scale: int) -> Photographs:
         """Return photographs for the renderer, with cameras and lights `views`."""
@@ -131,8 +134,9 @@ class FlashSearch:
         return torch.cat([place - self.given, self.ahead])[None]
 
     def joined(self, pictures: Iterable[Tensor]) -> Tensor:
-        """Return what is fine in a picture (n, H, W) for each of `parts`, at the pixels that are compared."""
-        return torch.cat([fine(picture, part.inside)[part.inside] for picture, part in zip(pictures, self.parts)])
+        """Return what is fine in a picture (n, H, W) for each of `parts`, weighted, at the pixels that are compared."""
+        return torch.cat([(part.weights * fine(picture, part.inside))[part.inside]
+                          for picture, part in zip(pictures, self.parts)])  # fmt: skip
 
     def with_halves(self) -> list[Subset]:
         """Return all pixels, and those of each half of the photographs."""
