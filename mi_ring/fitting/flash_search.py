@@ -167,7 +167,8 @@ class FlashSearch:
                 most, best, *_ = self.best_of(best + step * around(1))
         agree = all((other - best).norm() < 2 * STEP for other in others)
         told = most[0] >= SHARE * float(self.subsets[0].lacking.square().sum()) and (most > FACTOR * own).all()
-        if not (told and agree and (best - self.now).norm() >= NEAREST):
+        inner = best.norm() <= FAR - STEP  # otherwise the error may fall on and on: then something else is wrong
+        if not (told and agree and inner and (best - self.now).norm() >= NEAREST):
             return None
         return self.offset(best) / self.calibration.widths["light"]
 
