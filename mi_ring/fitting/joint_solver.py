@@ -37,7 +37,7 @@ def solve_jointly(
 ) -> dict[str, Tensor]:
     """Find the room beside other light. If a flash is the only other light and varies, find those of `SOLVED`, too.
 
-    `known`: those that stay as they are.
+    `known`: names of unknowns that stay as they are.
 
     Returns new values of the calibration: a dict from names of unknowns to tensors in the shape of the unknown, in
     units of its prior; of "ambient" the harmonics (BASIS, 3), of which a part is `believed`. It is empty if no

@@ -206,13 +206,12 @@ class Optimisation:
         level, progress = schedule.stage(iteration).level, schedule.progress(iteration)
         one_material = progress < problem.lighting.one_material_until  # the joint equations have many materials
         if schedule.joint_due(iteration) and not (calibration.room.alone or one_material):
-            sought = schedule.flash_due(iteration)
-            place = (
-                problem.processes.on_first(lambda: find_flash(problem, self.model, renderer, level)) if sought else None
-            )
-            known = {} if place is None else {"light": place}
-            for name, value in known.items():
-                calibration.get_parameter(name).data.copy_(value)
+            known: dict[str, Tensor] = {}
+            if schedule.flash_due(iteration):
+                place = problem.processes.on_first(lambda: find_flash(problem, self.model, renderer, level))
+                if place is not None:
+                    known["light"] = place
+                    calibration.get_parameter("light").data.copy_(place)
             joint = problem.processes.on_first(lambda: solve_jointly(problem, self.model, renderer, level, known))
             values = joint | known
             if not values:

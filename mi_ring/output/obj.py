@@ -17,25 +17,28 @@ def write_obj(path: Path, atlas: Atlas, texels: Texels, material: gltf.Material)
     `path`: the OBJ file; the other files lie beside it. `material`: the material at the N points of `texels`. Texture
     coordinates are duplicated along seams, vertices are not.
     """
-    baked, files = gltf.textures(material, texels), {}
-    for name, image in {
-        "diffuse": baked["baseColorTexture"], "normal": baked.get("normalTexture"),
+    baked, files, more = gltf.textures(material, texels), {}, []
+    images = {
+        "diffuse": baked["baseColorTexture"],
         "specular": baked["specularTexture"][..., 3, None],
         "roughness": baked["metallicRoughnessTexture"][..., 1, None],
         "metallic": baked["metallicRoughnessTexture"][..., 2, None],
-    }.items():  # fmt: skip
-        if image is None:
-            continue
+    }  # fmt: skip
+    if "normalTexture" in baked:
+        images["normal"] = baked["normalTexture"]
+    for name, image in images.items():
         files[name] = path.with_name(f"{path.stem}_{name}.png")
         write_image(image, files[name])
-    library, coat = path.with_suffix(".mtl"), []
+    library = path.with_suffix(".mtl")
+    if "normal" in files:
+        more.append(f"norm {files['normal'].name}")
     if material.coat is not None and material.coat_roughness is not None:  # programs read no textures of them
-        coat = [f"Pc {material.coat.mean():.4g}", f"Pcr {material.coat_roughness.mean():.4g}"]
+        more += [f"Pc {material.coat.mean():.4g}", f"Pcr {material.coat_roughness.mean():.4g}"]
     write_file(library, "\n".join([
         "newmtl fitted", "illum 2", "Kd 1 1 1", f"map_Kd {files['diffuse'].name}",
         "Ks {0:.4g} {0:.4g} {0:.4g}".format(min(0.04 * material.specular_color, 1)), f"map_Ks {files['specular'].name}",
         "Pr 1", f"map_Pr {files['roughness'].name}", "Pm 1", f"map_Pm {files['metallic'].name}",
-        *[f"norm {files[name].name}" for name in files if name == "normal"], *coat, "",
+        *more, "",
     ]))  # fmt: skip
     _, first, uncut = np.unique(atlas.uncut, return_index=True, return_inverse=True)
     corners = np.stack([uncut, np.arange(len(uncut)), uncut], 1)[atlas.faces] + 1
